@@ -1,0 +1,52 @@
+# make demo    install everything, then an arm goes round obstacles: what it does, a summary, a plot, a log
+# make test    install everything, lint, all tests
+# make lint    ruff, mypy, import floors
+# make bench   the speed figures on this machine
+# make lock    resolve requirements.lock anew from pyproject.toml
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+SYSTEM := $(VENV)/.system
+PYTEST_FLAGS ?=
+
+.DELETE_ON_ERROR:
+.PHONY: demo test lint bench install lock clean
+
+demo: install
+	$(BIN)/python -m tools.demo
+
+test: install lint
+	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+
+lint: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: install
+	$(BIN)/python -m tools.bench
+
+install: $(INSTALLED) $(SYSTEM)
+
+$(INSTALLED): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rtctl needs Python 3.11 or newer: make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+# Done once where it succeeds; where it may not install, it names the command and is asked again next time.
+$(SYSTEM): tools/setup.sh | $(INSTALLED)
+	@if sh tools/setup.sh; then touch $@; fi
+
+lock: $(INSTALLED)
+	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \
+		--strip-extras --allow-unsafe --extra test --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		--output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
