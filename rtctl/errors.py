@@ -1,0 +1,48 @@
+"""The error tree: start-up and user mistakes only; run-time faults are values, not exceptions."""
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_CONFIG = 78  # sysexits EX_CONFIG: the daemon refuses the file or the robot it finds
+
+
+class RtctlError(Exception):
+    """Root of everything a user can cause; printed as one line, never as a traceback."""
+
+    exit_code = EXIT_FAILED
+
+
+class ConfigError(RtctlError):
+    """A file, or what was found on the bus, contradicts what is needed to run safely.
+
+    `place` is the file and the path inside it (`configs/panda.toml: robot.joints[2].q_min_rad`),
+    `got` what came and `wanted` what would have been accepted.
+    """
+
+    exit_code = EXIT_CONFIG
+
+    def __init__(self, place: str, got: object, wanted: str) -> None:
+        self.place, self.got, self.wanted = place, got, wanted
+        super().__init__(f"{place}: got {got}, wanted {wanted}")
+
+
+class HandshakeError(ConfigError):
+    """The bus does not answer as the config says it must; drives were never enabled."""
+
+
+class LinkError(RtctlError):
+    """A bus or socket could not be opened or died in a way that retrying cannot mend."""
+
+
+class RequestError(RtctlError):
+    """An operator's request is malformed or not allowed now; nothing was changed."""
+
+
+class UsageError(RtctlError):
+    """A wrong call on the command line."""
+
+    exit_code = EXIT_USAGE
+
+
+class LogError(RtctlError):
+    """A log cannot be opened, written, or does not hold what is asked of it."""

@@ -1,0 +1,220 @@
+"""The nouns: plain values that every floor of the program shares. SI units, float64 arrays.
+
+Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
+"""
+
+from enum import IntEnum, IntFlag
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+B1 = NDArray[np.bool_]
+
+
+class State(IntEnum):
+    """Supervisor states; the order is that of a session, not of severity."""
+
+    BOOT = 0
+    PREFLIGHT = 1
+    IDLE = 2  # drives disabled, feedback watched
+    ARMED = 3  # drives being enabled, torque = hold
+    RUN = 4  # the law drives the arm
+    STOPPING = 5  # braking to rest, then held, then disabled
+    SAFE_STOP = 6  # SS1/SS2 latched: damped, an operator's reset leaves it
+    FAULT = 7  # STO latched: torque off
+
+
+class Verb(IntEnum):
+    """What an operator can ask for; TERM is SIGTERM."""
+
+    NONE = 0
+    ARM = 1
+    DISARM = 2
+    STOP = 3
+    RESET = 4
+    RECOVER = 5
+    TERM = 6
+
+
+class Status(IntEnum):
+    """Level of competence: what the controller is doing about the goal, and what holds it."""
+
+    NO_GOAL = 0
+    MOVING = 1
+    ARRIVED = 2
+    SHADOWED = 3  # goal within some obstacle's influence
+    LOCAL_MINIMUM = 4  # forces cancel, goal clear
+    SATURATED = 5  # torque limits hold the arm
+    SINGULAR = 6  # the direction to the goal is lost
+    LIMITED = 7  # joint limits hold the arm
+
+
+class Severity(IntEnum):
+    """Reactions, totally ordered: the worst wins."""
+
+    NONE = 0
+    LOG = 1
+    REJECT = 2
+    SS2 = 3  # brake along the path, hold under control
+    SS1 = 4  # damp, torque off at rest
+    STO = 5  # torque off now
+
+
+class Cut(IntFlag):
+    """Which protection altered the wanted torque this tick."""
+
+    NONE = 0
+    NON_FINITE = 1
+    MAGNITUDE = 2
+    SLEW = 4
+    MOTION_SCALED = 8  # motion gave way to obstacles and limits
+    SINGULAR = 16  # spectral damping of Lambda active
+    FIELD_CAP = 32  # repulsion capped below rho_num
+    SPEED = 64  # joint speed limiter active
+
+
+class Link(IntFlag):
+    """What the link saw during the cycle."""
+
+    NONE = 0
+    OVERFLOW = 1  # receive queue overflowed
+    SEND_FAILED = 2  # a command frame was dropped (ENOBUFS)
+    BUS_OFF = 4
+    ERROR_PASSIVE = 8
+    DOWN = 16  # interface down or gone
+    FOREIGN_COMMAND = 32  # somebody else sends our command ids
+    CORRUPT = 64  # a frame failed its CRC, length or id check
+    DUPLICATE = 128  # more than one reply of a joint in one cycle
+    SEQUENCE = 256  # a reply's counter jumped: frames were lost or overtook each other
+    DISORDER = 512  # counters keep jumping
+    LOG_DEGRADED = 1024  # set by the daemon: the log cannot be written
+
+
+class Drive(IntEnum):
+    """What a command asks of every joint drive this cycle."""
+
+    DISABLE = 0  # the stop frame: replies, never torque
+    ENABLE = 1
+    TORQUE = 2
+    CLEAR = 3  # clear a latched drive fault
+
+
+class Task(IntEnum):
+    """Which part of the pose the goal constrains."""
+
+    POSITION = 0
+    POSE = 1
+
+
+class Goal(NamedTuple):
+    """A goal pose of the tip in the world frame."""
+
+    position: F64  # (3,) [m]
+    wxyz: F64  # (4,) unit quaternion; ignored for Task.POSITION
+    task: Task
+    tolerance: float  # [m] arrived within this and within tolerance_rot
+    tolerance_rot: float  # [rad]
+
+
+class Shape(NamedTuple):
+    """An obstacle as it is described: a named, posed, possibly moving primitive."""
+
+    name: str
+    type: str  # sphere | capsule | segment | point | box | plane | ellipsoid | n_ellipsoid | ...
+    dims: F64  # (4,) meaning by type, see control.primitives
+    position: F64  # (3,) [m] of the primitive's frame in the world
+    wxyz: F64  # (4,) orientation
+    velocity: F64  # (3,) [m/s]
+    omega: F64  # (3,) [rad/s]
+
+
+class ObstacleEdit(NamedTuple):
+    """Set (shape given) or clear (shape None) one obstacle by name; `age` [s] of the observation."""
+
+    name: str
+    shape: Shape | None
+    age: float = 0.0
+
+
+class Request(NamedTuple):
+    """Everything that reaches the tick from operators and sensors in one slot."""
+
+    verb: Verb = Verb.NONE
+    goal: Goal | None = None
+    obstacles: tuple[ObstacleEdit, ...] = ()
+
+
+class Feedback(NamedTuple):
+    """What the link knows of the robot at one slot; the last good value where nothing came."""
+
+    slot: int  # index on the absolute grid
+    missed: int  # slots skipped since the previous tick
+    q: F64  # (n,) [rad]
+    qd: F64  # (n,) [rad/s]
+    tau: F64  # (n,) [Nm] torque the drive echoes
+    age: F64  # (n,) [s] of the newest reply at this slot
+    replies: I64  # (n,) replies of this cycle; exactly 1 is healthy
+    drive: I64  # (n,) drive status code (protocol.mit), -1 = never heard
+    link: int  # Link flags of the cycle
+    lateness: float  # [s] of the previous wake-up; logged, never used by the law
+    compute: float  # [s] of the previous tick; logged, never used by the law
+
+
+class Command(NamedTuple):
+    """What goes to the drives."""
+
+    drive: Drive
+    tau: F64  # (n,) [Nm]
+
+
+class Transport(Protocol):
+    """Moves raw `struct can_frame` (16 bytes) and `struct canfd_frame` (72 bytes); blocks only in wait and collect."""
+
+    def send(self, raw: bytes) -> bool: ...  # False: dropped, never queued
+
+    def send_all(self, frames: list[bytes]) -> list[bytes]: ...  # a cycle's frames at once; those that went out
+
+    def receive(self) -> list[bytes]: ...  # everything that waits
+
+    def collect(self, count: int, timeout: float) -> list[bytes]: ...  # waits for that many, or for silence [s]
+
+    def wait(self, timeout: float) -> bool: ...  # readable within timeout [s]
+
+    def flags(self) -> int: ...  # Link flags since the last call
+
+    def reopen(self) -> bool: ...  # one attempt after the bus went away
+
+    def close(self) -> None: ...
+
+
+class Truth(NamedTuple):
+    """The simulator's own account after a cycle: an oracle that the controller never sees."""
+
+    time: float  # [s] simulated
+    q: F64  # (n,)
+    qd: F64  # (n,)
+    tau: F64  # (n,) torque the joints really got
+    tip: F64  # (3,) tip position
+    tip_wxyz: F64  # (4,)
+    clearance: dict[str, float]  # obstacle name -> smallest distance to any link's collision shape [m]
+    self_clearance: float  # [m]
+    contacts: int  # contact events so far (arm against obstacles or itself)
+
+
+class Simulator(Protocol):
+    """Drives and plant in lockstep; found through the entry-point group `rtctl.simulator`."""
+
+    def exchange(self, frames: list[bytes]) -> list[bytes]: ...  # one servo period
+
+    def obstacles(self) -> list[ObstacleEdit]: ...  # what a perfect camera would report now
+
+    def truth(self) -> Truth: ...
+
+    def close(self) -> None: ...
+
+
+Record = NDArray[Any]  # one element of control.record.record_dtype(n, K)
