@@ -1,0 +1,59 @@
+"""What one tick leaves to the next: all of the controller's state, as one value."""
+
+from typing import NamedTuple
+
+from rtctl.control.estimator import JointEstimate, TipEstimate
+from rtctl.control.faults import Counters
+from rtctl.control.model import Model
+from rtctl.control.osc import OperationalSpace
+from rtctl.control.world import World
+from rtctl.types import F64, I64, Goal, Severity, State, Status, Task
+
+
+class Memory(NamedTuple):
+    """Everything a tick knows of the past."""
+
+    tick: int
+    # supervisor
+    state: State
+    since: int  # tick of entering the state
+    reaction: Severity  # of SAFE_STOP and FAULT, NONE elsewhere
+    off: bool  # SAFE_STOP has cut the torque and will not give it back
+    in_force: int  # faults
+    good: I64  # (faults,) ticks since each was present
+    counters: Counters
+    clear_until: int  # tick until which latched drive faults are being cleared
+    recovering: bool  # armed outside the joint limits, on request
+    outside: bool  # a joint is beyond its limits
+    leaving: bool  # SIGTERM came
+    done: bool  # nothing more to do: the daemon may leave
+    verdict: str  # why this tick's request was refused, '' when it was not
+    # estimates
+    joints: JointEstimate
+    tip: TipEstimate
+    innovation: float  # normalised, largest of this tick
+    model: Model
+    space: OperationalSpace
+    task: Task  # that `space` was evaluated for
+    evaluated: bool  # the model, this tick
+    phase: float  # model periods since the last evaluation was due, in (-1, 0]
+    qdd: F64  # (n,) [rad/s2] predicted from the torque of the last command
+    q_previous: F64  # (n,) [rad] of the last feedback
+    age_previous: F64  # (n,) [s] how old it was
+    rest: int  # ticks all joints have been at rest
+    # task
+    goal: Goal | None
+    hold: Goal  # where the tip stays without a goal
+    q_rest: F64  # (n,) [rad] posture of the hold
+    v_ref: F64  # (3,) [m/s]
+    w_ref: F64  # (3,) [rad/s]
+    goal_rho: F64  # (K,) [m] from the goal to each obstacle
+    status: Status
+    blocker: int  # obstacle slot or joint index that holds the arm, -1 for none
+    still: int  # ticks the tip has been at rest
+    # world and torque
+    world: World
+    rho: F64  # (K,) [m] from the arm to each obstacle
+    sent: F64  # (4, n) [Nm] the last commands, newest first
+    cut: int  # types.Cut of the last tick
+    pace: float  # fraction of qd_max that joints may have

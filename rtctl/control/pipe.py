@@ -1,0 +1,262 @@
+"""One tick: feedback and requests in, torque and a record out. Pure: no clock, socket, file or randomness.
+
+Equal inputs give equal bits, which is what makes replay, lockstep simulation and Monte-Carlo the same thing. The
+block diagram is `tick`; each block is a function below it or a module beside it.
+"""
+
+import numpy as np
+
+from rtctl.control import goals, primitives, scan, world
+from rtctl.control.estimator import joint_start, joint_step, start, tip_step, update_pose
+from rtctl.control.faults import FAULTS, Counters, severity
+from rtctl.control.goals import Progress
+from rtctl.control.law import Law, evaluate_law
+from rtctl.control.limits import Permitted, permit, slew_reference
+from rtctl.control.linalg import matvec
+from rtctl.control.memory import Memory
+from rtctl.control.model import Model
+from rtctl.control.osc import OperationalSpace, operational_space
+from rtctl.control.record import make_record
+from rtctl.control.robot import Robot
+from rtctl.control.session import (
+    REST_HOLD,
+    detected,
+    drives_torque,
+    held_here,
+    hold_at,
+    supervised,
+    with_goal,
+)
+from rtctl.control.so3 import error_to, quat_of
+from rtctl.types import (
+    Command,
+    Drive,
+    Feedback,
+    Goal,
+    ObstacleEdit,
+    Record,
+    Request,
+    Severity,
+    Shape,
+    State,
+    Status,
+    Task,
+    Verb,
+)
+
+BRAKING = (State.STOPPING, State.SAFE_STOP)
+ZERO = np.zeros(3)
+START_PACE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
+START_TIME = 0.5  # [s] about, in which they are given the rest
+MISSED_MAX = 10  # slots that estimates coast through; more is a fault
+
+
+def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> tuple[Memory, Command, Record]:
+    """Return (memory, command, record) of one servo period.
+
+    feedback: the drives' replies of this slot; request: what operators and sensors sent since the previous tick.
+    """
+    m = memory._replace(tick=memory.tick + 1, verdict="")
+    elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
+    m = _estimated(robot, m, feedback, elapsed)
+    m = _perceived(robot, m, request, elapsed)
+    m, present = detected(robot, m, feedback)
+    m = supervised(robot, m, feedback, request, present)
+    m = with_goal(robot, m, request)
+    m, law = _law(robot, m)
+    m, command, permitted = _commanded(robot, m, feedback, law)
+    m = _diagnosed(robot, m, law, permitted)
+    return m, command, _record(robot, m, feedback, request, law, permitted, command)
+
+
+def initial(robot: Robot, feedback: Feedback) -> Memory:
+    """Return the memory before the first tick: IDLE, at rest where the feedback says the arm is."""
+    q, zero = feedback.q.copy(), np.zeros(robot.n)
+    model = robot.body.evaluate(q, zero, robot.points, robot.own)
+    joints, tip = joint_start(q, robot.joint_P), start(model.x, model.R, robot.tip_design)
+    table = world.with_static(world.empty(robot.slots), robot.obstacles)
+    space = _space(robot, Task.POSE, model)
+    far = np.full(robot.slots, np.inf)
+    return Memory(
+        tick=-1, state=State.IDLE, since=-1, reaction=Severity.NONE, off=False, in_force=0,
+        good=np.full(len(FAULTS), 1 << 30), counters=Counters(), clear_until=-1, recovering=False, outside=False,
+        leaving=False, done=False, verdict="", joints=joints, tip=tip, innovation=0.0, model=model, space=space,
+        task=Task.POSE, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
+        goal=None, hold=hold_at(model.x, model.R),
+        q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
+        rho=far, sent=np.zeros((4, robot.n)), cut=0, pace=START_PACE,
+    )  # fmt: skip
+
+
+def _space(robot: Robot, task: Task, model: Model) -> OperationalSpace:
+    rows = 3 if task == Task.POSITION else 6
+    return operational_space(model.J, model.A_inv, model.Lambda_inv, rows, robot.motion)
+
+
+def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> Memory:
+    """Joint and tip state at this slot, `elapsed` [s] after the previous; the model anew when an evaluation is due."""
+    joints, surprise = joint_step(
+        m.joints, m.qdd, feedback.q, feedback.qd, feedback.age, feedback.replies > 0, elapsed, robot.joint_filter
+    )
+    phase = m.phase + robot.dt / robot.model_dt
+    task = m.goal.task if m.goal is not None else m.hold.task
+    due = phase > 0.0
+    model = robot.body.evaluate(joints.q, joints.qd, robot.points, robot.own) if due else m.model
+    space = _space(robot, task, model) if due or task != m.task else m.space
+    tip, innovation = tip_step(m.tip, m.model.J, m.model.Jdqd, m.qdd, model.J, joints.qd, elapsed, robot.estimator)
+    innovation = max(innovation, scan.largest(surprise))
+    if due:  # evaluated at the state of this slot: its age is zero
+        tip, other = update_pose(tip, model.x, model.R, 0.0, robot.estimator)
+        innovation = max(innovation, other)
+    return m._replace(
+        joints=joints, tip=tip, innovation=innovation, model=model, space=space, task=task,
+        evaluated=due, phase=phase - 1.0 if due else phase,
+    )  # fmt: skip
+
+
+def _perceived(robot: Robot, m: Memory, request: Request, elapsed: float) -> Memory:
+    """Obstacles: extrapolated by `elapsed` [s], then replaced by what was seen."""
+    table, verdict = world.advanced(m.world, elapsed), m.verdict
+    if request.obstacles:
+        table, verdict = world.edited(table, request.obstacles)
+    rho = m.goal_rho if m.goal is None else world.distance_from(table, m.goal.position)
+    return m._replace(world=table, verdict=verdict, goal_rho=rho)
+
+
+def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
+    """Choose what the tip does, then evaluate the law for it."""
+    braking = m.state in BRAKING or severity(m.in_force) >= Severity.SS2
+    pursuing = m.goal is not None and m.state == State.RUN and not braking
+    m = m._replace(pace=_pace(robot, m))
+    slow = braking and max(np.abs(m.v_ref).max(), np.abs(m.w_ref).max()) < 1e-3
+    if braking and not slow:
+        m = held_here(m)  # the hold begins where the braking ends
+    target = m.goal if pursuing and m.goal is not None else m.hold
+    hasten = not braking or slow  # while braking the references only fall to zero
+    e = target.position - m.tip.x if hasten else ZERO
+    e_rot = error_to(m.tip.R, target.wxyz) if m.task == Task.POSE and hasten else ZERO
+    law = evaluate_law(
+        robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
+        m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
+    )  # fmt: skip
+    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=law.rho), law
+
+
+def _pace(robot: Robot, m: Memory) -> float:
+    """Return the fraction of their speed that joints may have: an arm that wakes inside a field leaves it slowly."""
+    return START_PACE if m.state == State.ARMED or m.recovering else min(1.0, m.pace + robot.dt / START_TIME)
+
+
+def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[Memory, Command, Permitted]:
+    """Turn the law's torque into what the drives are asked for, through the permitter."""
+    drive, keep = law.drive, law.keep
+    if m.state == State.SAFE_STOP and m.reaction >= Severity.SS1:  # damp -D qd + g, then torque off
+        over = (m.tick - m.since) * robot.dt >= robot.stop.time or m.rest * robot.dt >= REST_HOLD
+        m = m._replace(off=m.off or over)
+        fresh = feedback.age <= robot.safety.lost_periods * robot.dt  # a velocity that old damps nothing
+        drive, keep = np.zeros(robot.n), m.model.g - robot.stop.damping * m.joints.qd * fresh
+    lag = max(1, round(scan.largest(feedback.age) / robot.dt))
+    reference = slew_reference(m.sent[0], feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, lag)
+    permitted = permit(drive, keep, m.joints.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt)
+    command = Command(_asked_of_drives(m, feedback), permitted.tau)
+    if command.drive != Drive.TORQUE:
+        command = command._replace(tau=np.zeros(robot.n))
+    moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
+    qdd = matvec(m.model.A_inv, command.tau - m.model.h - m.model.g) if moving else np.zeros(robot.n)
+    sent = scan.pushed(command.tau, m.sent)
+    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut), command, permitted
+
+
+def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
+    enabled = scan.all_equal(feedback.drive, 1)
+    if drives_torque(m):
+        if m.state == State.ARMED and not enabled:
+            return Drive.ENABLE
+        return Drive.TORQUE
+    if m.tick < m.clear_until and bool((feedback.drive > 1).any()):
+        return Drive.CLEAR
+    return Drive.DISABLE
+
+
+def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Memory:
+    """Level of competence: what the arm is doing about its goal."""
+    if m.goal is None or m.state != State.RUN:
+        return m._replace(status=Status.NO_GOAL, blocker=-1)
+    p = _progress(robot, m, law, permitted)
+    still = m.still + 1 if goals.at_rest(p) else 0
+    status, blocker = goals.diagnose(p, m.goal, still, round(robot.stop.stall / robot.dt))
+    return m._replace(status=status, blocker=blocker, still=still)
+
+
+def _progress(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Progress:
+    assert m.goal is not None
+    pose = m.goal.task == Task.POSE
+    return Progress(
+        error=scan.norm(m.goal.position - m.tip.x),
+        error_rot=scan.norm(error_to(m.tip.R, m.goal.wxyz)) if pose else 0.0,
+        speed=scan.norm(m.tip.xd),
+        rate=scan.norm(m.tip.omega) if pose else 0.0,
+        goal_rho=m.goal_rho,
+        rho=law.rho,
+        force=scan.norms(law.force),
+        tau_limits=law.tau_limits,
+        tau_max=robot.tau_max,
+        tau_wanted=permitted.tau_wanted,
+        damped=m.space.damped,
+        cut=m.cut,
+        rho0=robot.avoid.rho0,
+    )
+
+
+def _record(
+    robot: Robot, m: Memory, feedback: Feedback, request: Request, law: Law, permitted: Permitted, command: Command
+) -> Record:
+    """Write everything that came in and went out into one struct."""
+    goal = m.goal if m.goal is not None else m.hold
+    return make_record(
+        robot.n, robot.slots,
+        tick=m.tick, slot=feedback.slot, time=feedback.slot * robot.dt, missed=feedback.missed, link=feedback.link,
+        q=feedback.q, qd=feedback.qd, tau_measured=feedback.tau, age=feedback.age, replies=feedback.replies,
+        drive=feedback.drive, verb=request.verb, lateness=feedback.lateness, compute=feedback.compute,
+        x=m.tip.x, xd=m.tip.xd, wxyz=quat_of(m.tip.R), omega=m.tip.omega, innovation=m.innovation,
+        goal=goal.position, goal_wxyz=goal.wxyz, task=m.task, F=law.F, error=scan.norm(goal.position - m.tip.x),
+        error_rot=scan.norm(error_to(m.tip.R, goal.wxyz)) if m.task == Task.POSE else 0.0,
+        sigma_min=m.space.sigma_min, rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
+        tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
+        tau_gravity=m.model.g + m.model.h, tau_wanted=permitted.tau_wanted, tau_sent=command.tau,
+        command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, severity=m.reaction,
+        faults=m.in_force, model_evaluated=m.evaluated,
+    )  # fmt: skip
+
+
+def warm(robot: Robot) -> None:
+    """Run the tick through every kind of work once, so that nothing is compiled or loaded while the arm moves."""
+    n = robot.n
+    zero = np.zeros(n)
+    feedback = Feedback(
+        0,
+        0,
+        robot.home.copy(),
+        zero,
+        zero,
+        np.full(n, robot.dt),
+        np.ones(n, np.int64),
+        np.ones(n, np.int64),
+        0,
+        0.0,
+        0.0,
+    )
+    m = initial(robot, feedback)
+    far = np.array([0.0, 0.0, 50.0])
+    wxyz = np.array([1.0, 0.0, 0.0, 0.0])
+    edits = tuple(
+        ObstacleEdit(kind, Shape(kind, kind, np.array([0.1, 0.1, 0.1, 2.0]), far, wxyz, np.ones(3), np.ones(3)))
+        for kind in primitives.TYPES
+    )
+    for task in Task:
+        goal = Goal(m.tip.x, quat_of(m.tip.R), task, 1e-3, 1e-2)
+        moving = m._replace(state=State.RUN, goal=goal, in_force=0)
+        beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))
+        tick(robot, beside, feedback, Request(goal=goal, verb=Verb.RESET))  # the obstacles move on by themselves
+    stopping = m._replace(state=State.SAFE_STOP, reaction=Severity.SS1)
+    tick(robot, stopping, feedback, Request())

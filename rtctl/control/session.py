@@ -1,0 +1,173 @@
+"""The supervisor's work of one tick: faults in, events out, the state of the session moved by the table."""
+
+import math
+
+import numpy as np
+
+from rtctl.control import faults, goals, scan, supervisor, world
+from rtctl.control.faults import BIT, Evidence
+from rtctl.control.memory import Memory
+from rtctl.control.robot import Robot
+from rtctl.control.so3 import quat_of
+from rtctl.control.supervisor import Event
+from rtctl.types import Cut, Feedback, Goal, Request, Severity, State, Status, Task, Verb
+
+SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque builds up at its rate limit
+ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
+CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
+REST_SPEED = 0.03  # [rad/s] a joint slower than this rests (encoders of MIT drives resolve 0.005)
+REST_HOLD = 0.1  # [s] at rest before the drives are disabled
+STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushing, brakes do the rest
+NON_FINITE = int(Cut.NON_FINITE)  # a plain integer: a flag's & is slow
+
+EVENT_OF = {
+    Verb.ARM: Event.ARM,
+    Verb.RECOVER: Event.ARM,
+    Verb.DISARM: Event.DISARM,
+    Verb.STOP: Event.STOP,
+    Verb.RESET: Event.RESET,
+}
+EVENT_FOR = {Severity.SS2: Event.SS2, Severity.SS1: Event.SS1, Severity.STO: Event.STO}
+
+
+def drives_torque(m: Memory) -> bool:
+    """Return whether the state wants torque from the drives."""
+    if m.state == State.SAFE_STOP:
+        return not m.off
+    return m.state in (State.ARMED, State.RUN, State.STOPPING)
+
+
+def detected(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Memory, int]:
+    """Return the memory with the faults in force, and the bits of those present now."""
+    low, high = scan.span(m.sent)
+    evidence = Evidence(
+        active=drives_torque(m) and m.state != State.ARMED,
+        torque_low=low,
+        torque_high=high,
+        q_previous=m.q_previous,
+        age_previous=m.age_previous,
+        armed_outside=m.recovering,
+        not_finite=bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation),
+        contact=scan.any_below(m.rho, 0.0),
+        goal_inside=m.goal is not None and scan.any_below(m.goal_rho, 0.0),
+        feed_age=world.oldest(m.world),
+        innovation=m.innovation,
+    )
+    present, counters = faults.detect(
+        feedback, evidence, m.counters, robot.safety, robot.qd_max, robot.q_min, robot.q_max, robot.dt
+    )
+    in_force, good = faults.latch(present, m.in_force, m.good)
+    outside = scan.any_outside(feedback.q, robot.q_min, robot.q_max)
+    m = m._replace(
+        counters=counters,
+        in_force=in_force,
+        good=good,
+        q_previous=feedback.q,
+        age_previous=feedback.age,
+        outside=outside,
+        recovering=m.recovering and outside,
+        rest=0 if scan.any_faster(feedback.qd, REST_SPEED) else m.rest + 1,
+    )
+    return m, present
+
+
+def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:
+    """Return the memory after the supervisor's table took this tick's events."""
+    m, events = _asked(robot, m, request, present)
+    worst = faults.stops(m.in_force)
+    if worst >= Severity.SS2:
+        events.add(EVENT_FOR[worst])
+    events |= _timed(robot, m, scan.all_equal(feedback.drive, 1))
+    state, event = supervisor.next_state(m.state, events)
+    if state in (State.SAFE_STOP, State.FAULT):
+        m = m._replace(reaction=max(m.reaction, worst, Severity.SS2 if event == Event.STOP else Severity.NONE))
+    if state != m.state:
+        m = _entered(m, state)
+    if event == Event.ARM:
+        m = m._replace(recovering=m.outside)
+    at_rest = m.state in (State.IDLE, State.FAULT) or (m.state == State.SAFE_STOP and m.off)
+    return m._replace(done=m.leaving and at_rest)
+
+
+def _asked(robot: Robot, m: Memory, request: Request, present: int) -> tuple[Memory, set[Event]]:
+    """Return the event of the operator's verb, or the memory with the reason why there is none."""
+    verb = request.verb
+    if verb == Verb.NONE:
+        return m, set()
+    if verb == Verb.TERM:  # the second one does not wait for rest
+        return m._replace(leaving=True), {Event.STO if m.leaving else Event.TERM}
+    verdict = ""
+    if (m.state, EVENT_OF[verb]) not in supervisor.TABLE:
+        verdict = f"not possible in state {m.state.name}"
+    elif verb in (Verb.ARM, Verb.RECOVER):
+        verdict = _held_by(m.in_force & faults.REFUSES_ARMING)
+        if not verdict and m.outside and verb == Verb.ARM:
+            verdict = "a joint is beyond its limits: move it back by hand, or use recover"
+    elif verb == Verb.RESET:
+        m = m._replace(in_force=faults.cleared(m.in_force, present))
+        verdict = _held_by(m.in_force & ~_automatic())
+        if present & BIT["drive_fault"]:
+            m = m._replace(clear_until=m.tick + round(CLEAR_TIME / robot.dt))
+            verdict = "drive faults are being cleared now: reset again"
+    if verdict:
+        return m._replace(verdict=f"{verb.name.lower()}: {verdict}"), set()
+    return m, {EVENT_OF[verb]}
+
+
+def _automatic() -> int:
+    return sum(1 << i for i, fault in enumerate(faults.FAULTS) if fault.clear == "A")
+
+
+def _held_by(bits: int) -> str:
+    """Return what the faults in `bits` say, '' for none."""
+    return "; ".join(f"{name} ({faults.FAULTS[faults.INDEX[name]].text})" for name in faults.names(bits))
+
+
+def _timed(robot: Robot, m: Memory, enabled: bool) -> set[Event]:
+    """Return the events that come of waiting."""
+    elapsed = (m.tick - m.since) * robot.dt
+    if m.state == State.ARMED:
+        if enabled and elapsed >= SETTLE:
+            return {Event.SETTLED}
+        return {Event.TIMEOUT} if not enabled and elapsed >= ENABLE_TIMEOUT else set()
+    if m.state == State.STOPPING:
+        at_rest = m.rest * robot.dt >= REST_HOLD and elapsed >= REST_HOLD
+        return {Event.RESTED} if at_rest or not enabled or elapsed >= STOP_TIME else set()
+    return set()
+
+
+def _entered(m: Memory, state: State) -> Memory:
+    """Return the memory on entering a state: every motion begins from what is measured now."""
+    m = m._replace(state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False)
+    if state in (State.ARMED, State.RUN):
+        m = m._replace(v_ref=np.zeros(3), w_ref=np.zeros(3))
+    if state not in (State.SAFE_STOP, State.FAULT):
+        m = m._replace(reaction=Severity.NONE)
+    return held_here(m)
+
+
+def held_here(m: Memory) -> Memory:
+    """Return the memory with the pose and posture of now as those to hold."""
+    return m._replace(hold=hold_at(m.tip.x, m.tip.R), q_rest=m.joints.q)
+
+
+def hold_at(x: np.ndarray, R: np.ndarray) -> Goal:
+    """Return the goal of staying at x (3,) [m] with orientation R (3, 3)."""
+    return Goal(x.copy(), quat_of(R), Task.POSE, 0.0, 0.0)
+
+
+def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
+    """Return the memory with the request's goal, or with the reason why it was refused."""
+    goal = request.goal
+    if goal is None:
+        return m
+    verdict = ""
+    if m.state != State.RUN:
+        verdict = f"goal: not possible in state {m.state.name}"
+    elif m.outside:
+        verdict = "goal: a joint is still beyond its limits"
+    rho = world.distance_from(m.world, goal.position)
+    verdict = verdict or goals.refusal(goal, robot.base, robot.reach, rho, m.world.names)
+    if verdict:
+        return m._replace(verdict=verdict)
+    return m._replace(goal=goal, goal_rho=rho, status=Status.MOVING, blocker=-1, still=0)

@@ -1,0 +1,111 @@
+"""The obstacles the controller knows of now: a fixed table of slots, edited by name, moved by its own velocities."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from rtctl.control import scan
+from rtctl.control.primitives import Obstacles, advance, distances_into, fault_of, obstacles_empty, with_shape, without
+from rtctl.types import B1, F64, ObstacleEdit, Shape
+
+SLOTS = 64
+AGE_MAX = 3600.0  # [s] of an observation; NaN and times to come are none
+
+
+class World(NamedTuple):
+    """Obstacle slots; a name is '' where the slot is free."""
+
+    obstacles: Obstacles
+    names: tuple[str, ...]  # (K,)
+    age: F64  # (K,) [s] since the obstacle was last observed
+    moving: B1  # (K,) its observation grows stale
+
+
+def empty(slots: int = SLOTS) -> World:
+    """Return a table without obstacles."""
+    return World(obstacles_empty(slots), ("",) * slots, np.zeros(slots), np.zeros(slots, np.bool_))
+
+
+def with_static(world: World, shapes: tuple[Shape, ...]) -> World:
+    """Return the table with the config's own obstacles, which never grow stale."""
+    world, refusal = edited(world, tuple(ObstacleEdit(s.name, s) for s in shapes))
+    assert not refusal, refusal  # config bounds their number
+    return world._replace(moving=np.zeros_like(world.moving))
+
+
+def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
+    """Return the table after `edits`, and why an edit was refused ('' when none was)."""
+    refusal = ""
+    for edit in edits:
+        slots = [i for i, name in enumerate(world.names) if name and edit.name in (name, "*")]
+        if edit.shape is None:
+            for slot in slots:
+                world = _without(world, slot)
+            if not slots and edit.name != "*":
+                refusal = f"no obstacle is named {edit.name}"
+            continue
+        slot = slots[0] if slots else next((i for i, name in enumerate(world.names) if not name), -1)
+        if slot < 0:
+            refusal = f"obstacle {edit.name}: all {len(world.names)} slots are taken"
+            continue
+        fault = fault_of(edit.shape)
+        if not 0.0 <= edit.age <= AGE_MAX:
+            fault = f"age: got {edit.age} s, wanted 0 to {AGE_MAX:g}"
+        if fault:
+            refusal = f"obstacle {edit.name}: {fault}"
+            continue
+        world = _with(world, slot, edit)
+    return world, refusal
+
+
+def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
+    assert edit.shape is not None
+    age, moving = world.age.copy(), world.moving.copy()
+    age[slot] = edit.age
+    shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
+    moving[slot] = bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
+    names = (*world.names[:slot], edit.name, *world.names[slot + 1 :])
+    return World(with_shape(world.obstacles, slot, shape), names, age, moving)
+
+
+def _without(world: World, slot: int) -> World:
+    names = (*world.names[:slot], "", *world.names[slot + 1 :])
+    moving = world.moving.copy()
+    moving[slot] = False
+    return World(without(world.obstacles, slot), names, world.age, moving)
+
+
+def advanced(world: World, dt: float) -> World:
+    """Return the table dt [s] later: poses extrapolated, observations older."""
+    if not scan.any_set(world.moving):
+        return world
+    return World(advance(world.obstacles, dt), world.names, world.age + dt * world.moving, world.moving)
+
+
+def distance_from(world: World, x: F64) -> F64:
+    """Return the distance (K,) [m] of a point x (3,) to each obstacle, negative inside, inf for free slots."""
+    return _distance_from(x, world.obstacles)
+
+
+@njit(cache=True, fastmath=False)
+def _distance_from(x: F64, obstacles: Obstacles) -> F64:
+    slots = obstacles.active.shape[0]
+    out = np.empty((slots, 4, 1))
+    distances_into(x.copy().reshape(3, 1), np.zeros(1), obstacles, math.inf, out)
+    return out[:, 0, 0].copy()
+
+
+def oldest(world: World) -> float:
+    """Return the age [s] of the oldest observation of a moving obstacle, 0 without any."""
+    return _oldest(world.age, world.moving)
+
+
+@njit(cache=True, fastmath=False)
+def _oldest(age: F64, moving: B1) -> float:
+    oldest = 0.0
+    for k in range(age.shape[0]):
+        if moving[k] and age[k] > oldest:
+            oldest = age[k]
+    return oldest
