@@ -1,0 +1,51 @@
+"""TOML to checked structs to the derived `Robot`; every refusal a deployment can meet offline.
+
+`load` reads and checks the file alone; `build` adds what needs the URDF; `check` reports the derived robot.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rtctl.config.read import read
+from rtctl.config.rules import bus_load, refuse, scales
+from rtctl.config.structs import Config
+
+if TYPE_CHECKING:
+    from rtctl.config.report import Report
+    from rtctl.control.robot import Robot
+
+__all__ = ["Config", "build", "bus_load", "check", "json_schema", "load", "scales"]
+
+
+def load(path: str | Path) -> Config:
+    """Return the checked config of a TOML file.
+
+    Raises ConfigError for a key that is missing, unknown, of a wrong type, not finite, out of its bounds, or in
+    contradiction with another.
+    """
+    config: Config = read(Path(path), Config)
+    refuse(config, str(path))
+    return config
+
+
+def build(config: Config, path: str | Path) -> "Robot":
+    """Return the derived robot; `path` is the config's file. Raises ConfigError where the URDF contradicts it."""
+    from rtctl.config.derive import build as derived  # imported when needed: the rigid-body library takes its time
+
+    return derived(config, path)
+
+
+def check(config: Config, robot: "Robot") -> "Report":
+    """Return the report of a config and its derived robot that `rtctl check` prints."""
+    from rtctl.config.report import report
+
+    return report(config, robot)
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a config file, from the same structs that check it."""
+    schema = msgspec.json.schema(Config)
+    named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rtctl robot config", **schema}
+    return dict(msgspec.json.decode(msgspec.json.encode(named)))  # tuples become the lists of JSON

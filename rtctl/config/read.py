@@ -1,0 +1,207 @@
+"""TOML, or JSON already parsed, into checked structs; errors name file, path, what came and what was wanted."""
+
+import difflib
+import re
+import tomllib
+from datetime import date, time
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from rtctl.errors import ConfigError
+
+T = TypeVar("T")
+MAX_BYTES = 1 << 20  # a config is a page or two; anything larger is the wrong file
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
+
+_ABSENT = object()
+
+
+def parse(path: Path) -> dict[str, Any]:
+    """Return the file's TOML as dicts and lists.
+
+    Raises ConfigError naming the file, and line and column of a syntax error.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(str(path), f"{path.stat().st_size} bytes", f"at most {MAX_BYTES}")
+        text = path.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise ConfigError(str(path), (error.strerror or "an unreadable file").lower(), "a readable TOML file") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), f"byte {error.object[error.start]:#04x} at {error.start}", "UTF-8 text") from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        what, _, where = str(error).partition(" (at ")
+        line = where.rstrip(")").replace("end of document", f"line {len(text.splitlines())}, the end")
+        raise ConfigError(f"{path}: {line}", f"a syntax error ({what[:1].lower()}{what[1:]})", "TOML") from None
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a list nested thousands deep
+        raise ConfigError(str(path), "a number too long or a nesting too deep to read", "TOML of a sane size") from None
+
+
+def read(path: Path, kind: Any) -> Any:
+    """Return the file as a checked struct of `kind`."""
+    return convert(parse(path), kind, str(path))
+
+
+def convert(data: object, kind: Any, source: str) -> Any:
+    """Return `data` as a checked `kind`; raises ConfigError whose place is `source: path.inside[3].it`."""
+    _refuse_odd_names(data, source, "")
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at `")
+    raise _explain(data, kind, source, message, where.rstrip("`"))
+
+
+def _refuse_odd_names(data: object, source: str, path: str) -> None:
+    """Refuse a name that no table has, before it gets into a message: line breaks, quotes, a page of text."""
+    if isinstance(data, dict):
+        for key, value in data.items():
+            if not NAME.fullmatch(key):
+                raise ConfigError(name_place(source, path), f"the name {_show(key)}", "names of letters, digits, _.+-")
+            _refuse_odd_names(value, source, f"{path}.{key}")
+    elif isinstance(data, list):
+        for i, value in enumerate(data):
+            _refuse_odd_names(value, source, f"{path}[{i}]")
+
+
+def name_place(source: str, path: str) -> str:
+    """Return the place of a path inside a source as every error writes it."""
+    return f"{source}: {path.lstrip('.')}" if path else source
+
+
+def _explain(data: object, kind: Any, source: str, message: str, where: str) -> ConfigError:
+    """Return msgspec's complaint in our words: the value that came, and everything its place accepts."""
+    keys = re.findall(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]", where)
+    path, node = "", inspect.type_info(kind)
+    value: Any = data
+    for name, index in keys:
+        key: Any = name or (int(index) if index != "..." else _culprit(value, node))
+        path += f".{key}" if isinstance(key, str) else f"[{key}]"
+        node = _inside(node, value, key)
+        value = value[key] if isinstance(value, list) or key in value else _ABSENT
+    if where.startswith("key"):  # the only names that users invent are those of drives
+        return ConfigError(name_place(source, path), f"names {', '.join(value)}", describe(_key(node)))
+    named = re.search(r"(missing required|unknown) field `(.*?)`", message)
+    if named is None:
+        return ConfigError(name_place(source, path), _show(value), describe(node))
+    table = _table(node, value)
+    place = name_place(source, f"{path}.{named[2]}")
+    fields = {f.encode_name: f.type for f in table.fields}
+    if table.tag_field:
+        fields = {str(table.tag_field): _tags(node)} | fields
+    if named[1] != "unknown":
+        return ConfigError(place, "nothing", describe(fields[named[2]]))
+    close = difflib.get_close_matches(named[2], list(fields), n=1, cutoff=0.5)
+    wanted = f"{close[0]} (the nearest valid name)" if close else f"one of {', '.join(fields)}"
+    return ConfigError(place, "an unknown name", wanted)
+
+
+def _culprit(value: Any, node: inspect.Type) -> str:
+    """Return the key of the first entry of a dict that does not convert; msgspec only says [...]."""
+    entry = _member(_member(node, inspect.DictType).value_type, inspect.StructType)
+    for key, item in value.items():
+        try:
+            msgspec.convert(item, entry.cls)
+        except msgspec.ValidationError:
+            return str(key)
+    raise AssertionError(f"no fault in {value}")
+
+
+def _plain(node: inspect.Type) -> list[inspect.Type]:
+    """Return the alternatives of a type, metadata peeled off and None left out."""
+    if isinstance(node, inspect.Metadata):
+        return _plain(node.type)
+    if isinstance(node, inspect.UnionType):
+        return [t for part in node.types for t in _plain(part) if not isinstance(t, inspect.NoneType)]
+    return [node]
+
+
+def _member(node: inspect.Type, kind: type[T]) -> T:
+    return next(t for t in _plain(node) if isinstance(t, kind))
+
+
+def _key(node: inspect.Type) -> inspect.Type:
+    key: inspect.Type = _member(node, inspect.DictType).key_type
+    return key
+
+
+def _inside(node: inspect.Type, value: Any, key: Any) -> inspect.Type:
+    """Return the type of what is at `key` inside a value of type `node`."""
+    if isinstance(key, str):
+        options = _plain(node)
+        if isinstance(options[0], inspect.DictType):
+            inner: inspect.Type = options[0].value_type
+            return inner
+        table = _table(node, value)
+        if key == table.tag_field:
+            return _tags(node)
+        fields: dict[str, inspect.Type] = {f.encode_name: f.type for f in table.fields}
+        return fields[key]
+    for option in _plain(node):
+        if isinstance(option, inspect.TupleType):
+            item: inspect.Type = option.item_types[key]
+            return item
+        if isinstance(option, inspect.VarTupleType):
+            every: inspect.Type = option.item_type
+            return every
+    raise AssertionError(f"no list in {node}")
+
+
+def _table(node: inspect.Type, value: Any) -> inspect.StructType:
+    """Return the struct meant by a table: the one whose tag it carries where there are several."""
+    tables = [t for t in _plain(node) if isinstance(t, inspect.StructType)]
+    tag = value.get(tables[0].tag_field) if isinstance(value, dict) else None
+    return next((t for t in tables if t.tag == tag), tables[0])
+
+
+def _tags(node: inspect.Type) -> inspect.LiteralType:
+    return inspect.LiteralType(tuple(str(t.tag) for t in _plain(node) if isinstance(t, inspect.StructType)))
+
+
+def _show(value: object) -> str:
+    """Return what came, short enough for one line."""
+    if value is _ABSENT:
+        return "nothing"
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = str(value) if isinstance(value, date | time) else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def describe(node: inspect.Type) -> str:
+    """Return in words everything a type accepts."""
+    options = _plain(node)
+    if all(isinstance(option, inspect.StructType) and option.tag_field for option in options):
+        return f"a table whose type is {describe(_tags(node))}"
+    return " or ".join(_describe(option) for option in options)
+
+
+def _describe(node: inspect.Type) -> str:
+    match node:
+        case inspect.FloatType():
+            return f"a number from {node.ge:g} to {node.le:g}"
+        case inspect.IntType():
+            return f"an integer from {node.ge} to {node.le}"
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.LiteralType():
+            return f"one of {', '.join(str(v) for v in node.values)}"
+        case inspect.StrType():
+            what = "letters, digits, _.+-" if node.pattern else "characters"
+            return f"a text of {node.min_length} to {node.max_length} {what}"
+        case inspect.TupleType():
+            return f"a list of {len(node.item_types)}, the first {describe(node.item_types[0])}"
+        case inspect.VarTupleType():
+            return f"a list of {node.min_length or 0} to {node.max_length}, each {describe(node.item_type)}"
+        case inspect.StructType():
+            return f"a table with {', '.join(f.encode_name for f in node.fields)}"
+        case _:
+            return "a table"
