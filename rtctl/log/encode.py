@@ -1,0 +1,303 @@
+"""Entries of the ring into MCAP message records, many at a time and in their order."""
+
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtctl.log import schema
+from rtctl.log.entry import Batch, Kind, Payload
+from rtctl.log.header import Header
+from rtctl.log.schema import MESSAGE, Layout
+from rtctl.types import I64, U8
+
+OP_MESSAGE = 5
+CAN_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("data", "u1", (8,))])
+CANFD_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("data", "u1", (64,))])
+EFF, RTR, ERR = 0x80000000, 0x40000000, 0x20000000  # flag bits of the kernel's can_id
+BRS, ESI = 0x01, 0x02  # of canfd_frame.flags
+LEVELS = {
+    "rejected": 3,
+    "fault": 4,
+}  # of foxglove.Log (3 warning, 4 error) by the event's name; 2, info, for the others
+
+
+class Encoded(NamedTuple):
+    """Whole message records and where they are; columns of equal length, in the order of `data`."""
+
+    data: bytes
+    channel: I64
+    sequence: I64
+    time: I64  # log_time [ns]
+    offset: I64  # in data
+
+
+class _Rows(NamedTuple):
+    """Template of a constant-size piece of one or two message records, and its parts."""
+
+    template: U8
+    dtype: np.dtype[np.void]
+
+
+def _rows(parts: Sequence[tuple[int, Layout]]) -> _Rows:
+    """Return the rows that hold one message of each (channel, layout), one behind the other."""
+    fields: list[tuple[str, Any]] = []
+    for number, (_, layout) in enumerate(parts):
+        fields += [(f"head{number}", MESSAGE), (f"body{number}", layout.wire)]
+    dtype = np.dtype(fields)
+    template = np.zeros(dtype.itemsize, np.uint8)
+    row = template.view(dtype)
+    for number, (channel, layout) in enumerate(parts):
+        head = row[f"head{number}"]
+        head["op"], head["channel"] = OP_MESSAGE, channel
+        head["length"] = MESSAGE.itemsize - 9 + layout.wire.itemsize
+        start = dtype.fields[f"body{number}"][1]  # type: ignore[index]
+        template[start : start + layout.wire.itemsize] = layout.template
+    return _Rows(template, dtype)
+
+
+def message(channel: int, sequence: int, time: int, data: bytes) -> bytes:
+    """Return one message record."""
+    head = np.zeros(1, MESSAGE)
+    head["op"], head["length"], head["channel"] = OP_MESSAGE, MESSAGE.itemsize - 9 + len(data), channel
+    head["sequence"], head["log"], head["publish"] = sequence & 0xFFFFFFFF, time, time
+    return head.tobytes() + data
+
+
+class Encoder:
+    """Turns batches into message records; remembers the last entry seen, so that holes become dropouts.
+
+    offset: log_time - monotonic time [ns], one for each segment.
+    """
+
+    def __init__(self, header: Header, number: int = 0) -> None:
+        self.header = header
+        self.offset = 0
+        self.number = number  # of the last entry encoded
+        self.time = 0  # [ns] its monotonic time
+        self.dropped = 0  # entries missing so far, by the holes in their numbers
+        self.malformed = 0  # entries of a wrong size or kind
+        self.channels = schema.channels(header)
+        self._id = {channel.topic: channel.id for channel in self.channels}
+        self._can_id = [self._id[schema.can_topic(bus)] for bus in header.buses]
+        self._own: dict[int, int] = {}  # sequence numbers of the channels that the recorder itself writes
+        joints = schema.joint_state_layout(header.joints)
+        self._tick = _rows(
+            [(self._id[schema.TICK], schema.tick_layout(header.dtype)), (self._id[schema.JOINT_STATES], joints)]
+        )
+        self._has_state = {"q", "qd", "tau_measured"} <= set(header.dtype.names or ())
+        self._can: dict[tuple[int, int], _Rows] = {}
+
+    def encode(self, batch: Batch) -> Encoded:
+        """Return the records of a batch, dropouts found on the way first.
+
+        Entries that make no sense are counted in `malformed` and left out.
+        """
+        pieces: list[Payload] = [b""] * len(batch.kind)
+        columns: list[tuple[I64, int, I64, I64, int]] = []
+        time = np.array(batch.time, dtype=np.int64)
+        sequence = np.array(batch.sequence, dtype=np.int64)
+        for key, indices in self._groups(batch).items():
+            rows = np.array(indices, dtype=np.int64)
+            payloads = [batch.payload[i] for i in indices]
+            columns += self._group(key, rows, payloads, time[rows], sequence[rows], pieces)
+        dropouts = self._dropouts(batch)
+        return _assembled(dropouts, pieces, columns)
+
+    def own(self, topic: str, time: int, content: dict[str, Any]) -> Encoded:
+        """Return one message of the recorder itself; time: monotonic [ns]."""
+        channel = self._id[topic]
+        sequence = self._own[channel] = self._own.get(channel, 0) + 1
+        data = message(channel, sequence, time + self.offset, json.dumps(content).encode())
+        return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel, sequence, time + self.offset, 0)))
+
+    def _groups(self, batch: Batch) -> dict[tuple[int, int, int], list[int]]:
+        """Return the entries' indices by what can be encoded in one go: kind, payload size and data size."""
+        groups: dict[tuple[int, int, int], list[int]] = {}
+        for index, (kind, payload) in enumerate(zip(batch.kind, batch.payload, strict=True)):
+            size = len(payload)
+            data = payload[4] if size in (16, 72) else 0  # a frame's len; anything for the others
+            key = (kind, size, data)
+            if key in groups:
+                groups[key].append(index)
+            else:
+                groups[key] = [index]
+        return groups
+
+    def _group(
+        self,
+        key: tuple[int, int, int],
+        rows: I64,
+        payloads: list[Payload],
+        time: I64,
+        sequence: I64,
+        pieces: list[Payload],
+    ) -> list[tuple[I64, int, I64, I64, int]]:
+        """Encode one group into `pieces`; return (rows, channel, time, sequence, offset in the piece) of its parts."""
+        kind, size, data = key
+        stamp = time + self.offset
+        base = kind & 0xFF
+        if kind == Kind.TICK and size == self.header.dtype.itemsize:
+            block = self._ticks(payloads, stamp, sequence)
+            second = MESSAGE.itemsize + self._tick.dtype["body0"].itemsize
+            parts = [(self._id[schema.TICK], 0), (self._id[schema.JOINT_STATES], second)]
+            if not self._has_state:
+                block, parts = block[:, :second], parts[:1]
+        elif base in (Kind.CAN_TX, Kind.CAN_RX) and size in (16, 72) and kind >> 8 < len(self._can_id):
+            channel = self._can_id[kind >> 8]
+            block = self._frames(payloads, base, channel, min(data, size - 8), stamp, time, sequence)
+            parts = [(channel, 0)]
+        elif kind in (Kind.EVENT, Kind.REQUEST):
+            return self._texts(kind, rows, payloads, stamp, sequence, pieces)
+        else:
+            self.malformed += len(rows)
+            return []
+        width = block.shape[1]
+        view = memoryview(block.tobytes())
+        for number, row in enumerate(rows.tolist()):
+            pieces[row] = view[number * width : (number + 1) * width]
+        return [(rows, channel, stamp, sequence, at) for channel, at in parts]
+
+    def _ticks(self, payloads: list[Payload], stamp: I64, sequence: I64) -> U8:
+        record = np.frombuffer(b"".join(payloads), self.header.dtype)
+        block = _copies(self._tick.template, len(payloads))
+        rows = block.reshape(-1).view(self._tick.dtype)
+        _stamp(rows["head0"], stamp, sequence)
+        body = rows["body0"]
+        for name in self.header.dtype.names or ():
+            body[name] = record[name]
+        if self._has_state:
+            _stamp(rows["head1"], stamp, sequence)
+            state = rows["body1"]
+            state["sec"], state["nanosec"] = stamp // 1_000_000_000, stamp % 1_000_000_000
+            state["position"], state["velocity"] = record["q"], record["qd"]
+            state["effort"] = record["tau_measured"]
+        return block
+
+    def _frames(
+        self, payloads: list[Payload], kind: int, channel: int, size: int, stamp: I64, time: I64, sequence: I64
+    ) -> U8:
+        found = self._can.get((channel, size))
+        if found is None:
+            found = self._can[channel, size] = _rows([(channel, schema.can_layout(size))])
+        fd = len(payloads[0]) == 72
+        frame = np.frombuffer(b"".join(payloads), CANFD_FRAME if fd else CAN_FRAME)
+        block = _copies(found.template, len(payloads))
+        rows = block.reshape(-1).view(found.dtype)
+        _stamp(rows["head0"], stamp, sequence)
+        body = rows["body0"]
+        extended = (frame["id"] & EFF) != 0
+        body["stamp_ns"], body["dlc"] = time, size
+        wide = (frame["id"] & (EFF | ERR)) != 0
+        body["id"] = frame["id"] & np.where(wide, np.uint32(0x1FFFFFFF), np.uint32(0x7FF))
+        body["direction"] = schema.TX if kind == Kind.CAN_TX else schema.RX
+        body["is_extended"], body["is_rtr"] = extended, (frame["id"] & RTR) != 0
+        body["is_error"] = (frame["id"] & ERR) != 0
+        if fd:
+            body["fd"], body["brs"], body["esi"] = 1, (frame["flags"] & BRS) != 0, (frame["flags"] & ESI) != 0
+        if size:
+            body["data"] = frame["data"][:, :size]
+        return block
+
+    def _texts(
+        self, kind: int, rows: I64, payloads: list[Payload], stamp: I64, sequence: I64, pieces: list[Payload]
+    ) -> list[tuple[I64, int, I64, I64, int]]:
+        channel = self._id[schema.EVENT if kind == Kind.EVENT else schema.REQUEST]
+        times, sequences = stamp.tolist(), sequence.tolist()
+        for number, row in enumerate(rows.tolist()):
+            data = bytes(payloads[number])
+            if kind == Kind.EVENT:
+                data = log_message(data, times[number])
+            pieces[row] = message(channel, sequences[number], times[number], data)
+        return [(rows, channel, stamp, sequence, 0)]
+
+    def _dropouts(self, batch: Batch) -> list[Encoded]:
+        """Return a dropout for every hole in the entries' numbers, and move on."""
+        if not batch.number:
+            return []
+        found = []
+        if batch.number[-1] - self.number != len(batch.number):
+            before, since = self.number, self.time
+            for number, time in zip(batch.number, batch.time, strict=True):
+                if number != before + 1:
+                    found.append(self._dropout(number - before - 1, since, time))
+                before, since = number, time
+        self.number, self.time = batch.number[-1], batch.time[-1]
+        return found
+
+    def _dropout(self, count: int, since: int, until: int) -> Encoded:
+        self.dropped += count
+        offset = self.offset
+        return self.own(schema.DROPOUT, until, {"count": count, "from_ns": since + offset, "to_ns": until + offset})
+
+    def missing(self, number: int, time: int) -> list[Encoded]:
+        """Return a dropout for the entries after the last one encoded up to `number`: they will never come."""
+        count = number - self.number
+        if count <= 0:
+            return []
+        since, self.number = self.time, number
+        return [self._dropout(count, since, time)]
+
+
+def _copies(template: U8, n: int) -> U8:
+    block = np.empty((n, len(template)), np.uint8)
+    block[:] = template
+    return block
+
+
+def _stamp(head: np.ndarray[Any, Any], stamp: I64, sequence: I64) -> None:
+    head["sequence"], head["log"], head["publish"] = sequence, stamp, stamp
+
+
+def log_message(event: bytes, time: int) -> bytes:
+    """Return an event as a foxglove.Log in JSON; what is not a JSON object becomes its message."""
+    try:
+        data = json.loads(event)
+    except (ValueError, RecursionError):
+        data = None
+    if not isinstance(data, dict):
+        data = {"message": bytes(event).decode("utf-8", "replace")}
+    text = data.get("message") or ": ".join(str(data[key]) for key in ("name", "detail") if data.get(key))
+    log = {
+        "timestamp": {"sec": time // 1_000_000_000, "nsec": time % 1_000_000_000},
+        "level": LEVELS.get(str(data.get("name")), 2),
+        "message": str(text),
+        "name": "rtctl",
+        "file": "",
+        "line": 0,
+        "data": data,
+    }
+    return json.dumps(log).encode()
+
+
+def _assembled(first: list[Encoded], pieces: list[Payload], columns: list[tuple[I64, int, I64, I64, int]]) -> Encoded:
+    """Return everything as one block, its columns in the order of the bytes."""
+    lead = b"".join(e.data for e in first)
+    sizes = np.fromiter(map(len, pieces), np.int64, len(pieces))
+    starts = np.cumsum(sizes) - sizes + len(lead)
+    channel, time, sequence, offset = ([] for _ in range(4))  # type: tuple[list[I64], list[I64], list[I64], list[I64]]
+    at = 0
+    for e in first:
+        channel.append(e.channel)
+        time.append(e.time)
+        sequence.append(e.sequence)
+        offset.append(e.offset + at)
+        at += len(e.data)
+    for rows, number, stamp, counted, within in columns:
+        channel.append(np.full(len(rows), number, dtype=np.int64))
+        time.append(stamp)
+        sequence.append(counted)
+        offset.append(starts[rows] + within)
+    if not channel:
+        none = np.zeros(0, dtype=np.int64)
+        return Encoded(b"", none, none, none, none)
+    offsets = np.concatenate(offset)
+    order = np.argsort(offsets, kind="stable")
+    return Encoded(
+        lead + b"".join(pieces),
+        np.concatenate(channel)[order],
+        np.concatenate(sequence)[order],
+        np.concatenate(time)[order],
+        offsets[order],
+    )

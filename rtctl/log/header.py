@@ -1,0 +1,134 @@
+"""The header of a log: everything that is known before the first tick, enough to replay the log alone."""
+
+import json
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtctl.control.record import record_dtype
+
+PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
+
+FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
+
+
+class Header(NamedTuple):
+    """What each segment of a log carries as metadata and attachments."""
+
+    robot: str
+    joints: tuple[str, ...]  # names, in the order of q
+    slots: int  # obstacle slots of a record
+    period: float  # [s] of the servo
+    buses: tuple[str, ...]  # topic names; an entry's `kind >> 8` is the index
+    config: str  # the text of the configuration file
+    urdf: str  # the text of the URDF
+    dtype: np.dtype[np.void]  # of the record
+    versions: Mapping[str, str]
+    revision: str  # of the program's own repository, "" when it does not run from one
+    extra: Mapping[str, str]  # handshake values, realtime settings, ...
+    files: Mapping[str, str]  # further attachments: name -> text (scenario, DBC)
+
+    @property
+    def config_sha256(self) -> str:
+        """Return the hash under which the configuration is known."""
+        return sha256(self.config.encode()).hexdigest()
+
+
+def make_header(
+    robot: str,
+    joints: Sequence[str],
+    slots: int,
+    period: float,
+    config: str = "",
+    urdf: str = "",
+    buses: Sequence[str] = ("can0",),
+    extra: Mapping[str, str] | None = None,
+    files: Mapping[str, str] | None = None,
+) -> Header:
+    """Return the header of a robot of `joints` and `slots` obstacle slots ticking each `period` [s]."""
+    return Header(
+        robot=robot,
+        joints=tuple(joints),
+        slots=slots,
+        period=period,
+        buses=tuple(buses),
+        config=config,
+        urdf=urdf,
+        dtype=record_dtype(len(joints), slots),
+        versions=versions(),
+        revision=revision(),
+        extra=dict(extra or {}),
+        files=dict(files or {}),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the interpreter, the kernel and the packages that decide the results."""
+    found = {"python": platform.python_version(), "kernel": platform.release(), "machine": platform.machine()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def revision() -> str:
+    """Return what `git describe` says of the program's own folder, or "" when it cannot say."""
+    folder = Path(__file__).resolve().parent
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=False)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def dtype_to_json(dtype: np.dtype[Any]) -> str:
+    """Return a record dtype as JSON text: [[name, format] or [name, format, shape], ...]."""
+    return json.dumps(dtype.descr)
+
+
+def dtype_from_json(text: str) -> np.dtype[np.void]:
+    """Return the dtype that `dtype_to_json` wrote.
+
+    Raises ValueError, TypeError or KeyError on anything else.
+    """
+    fields = [(str(f[0]), str(f[1]), tuple(f[2])) if len(f) > 2 else (str(f[0]), str(f[1])) for f in json.loads(text)]
+    dtype = np.dtype(fields)
+    if unknown := {f.base.str for f in (dtype[name] for name in dtype.names or ())} - FIXED:
+        raise ValueError(f"types {sorted(unknown)}, wanted some of {sorted(FIXED)}")
+    return dtype
+
+
+def header_to_json(header: Header) -> str:
+    """Return the header as JSON text, for the ring and for the log's metadata."""
+    return json.dumps(header._replace(dtype=dtype_to_json(header.dtype))._asdict())  # type: ignore[arg-type]
+
+
+def header_from_json(text: str) -> Header:
+    """Return the header that `header_to_json` wrote.
+
+    Raises ValueError, TypeError or KeyError on anything else.
+    """
+    raw = json.loads(text)
+    return Header(
+        robot=str(raw["robot"]),
+        joints=tuple(map(str, raw["joints"])),
+        slots=int(raw["slots"]),
+        period=float(raw["period"]),
+        buses=tuple(map(str, raw["buses"])),
+        config=str(raw["config"]),
+        urdf=str(raw["urdf"]),
+        dtype=dtype_from_json(raw["dtype"]),
+        versions={str(k): str(v) for k, v in raw["versions"].items()},
+        revision=str(raw["revision"]),
+        extra={str(k): str(v) for k, v in raw["extra"].items()},
+        files={str(k): str(v) for k, v in raw["files"].items()},
+    )

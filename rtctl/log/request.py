@@ -1,0 +1,63 @@
+"""Requests and events as JSON: the only inputs of a tick that have no fixed size. Floats round-trip to the bit."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from rtctl.types import Goal, ObstacleEdit, Request, Shape, Task, Verb
+
+
+def encode_request(tick: int, request: Request) -> bytes:
+    """Return the JSON of what the tick of index `tick` was asked."""
+    body: dict[str, Any] = {"tick": tick, "verb": request.verb.name.lower()}
+    if request.goal is not None:
+        body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items()}
+    if request.obstacles:
+        body["obstacles"] = [
+            {"name": e.name, "age": e.age, "shape": None if e.shape is None else _shape(e.shape)}
+            for e in request.obstacles
+        ]
+    return msgspec.json.encode(body)
+
+
+def decode_request(data: bytes) -> tuple[int, Request]:
+    """Return the tick index and the request of `encode_request`'s JSON. Raises ValueError."""
+    try:
+        body = msgspec.json.decode(data)
+        goal = body.get("goal")
+        edits = tuple(
+            ObstacleEdit(e["name"], None if e["shape"] is None else _shape_of(e["shape"]), float(e["age"]))
+            for e in body.get("obstacles", ())
+        )
+        return int(body["tick"]), Request(Verb[body["verb"].upper()], None if goal is None else _goal(goal), edits)
+    except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"not a request: {error}") from None
+
+
+def encode_event(tick: int, time: float, name: str, detail: str) -> bytes:
+    """Return the JSON of an event at robot time `time` [s]."""
+    return msgspec.json.encode({"tick": tick, "time": time, "name": name, "detail": detail})
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _shape(shape: Shape) -> dict[str, Any]:
+    return {k: _plain(v) for k, v in shape._asdict().items()}
+
+
+def _shape_of(body: dict[str, Any]) -> Shape:
+    arrays = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
+    return Shape(name=body["name"], type=body["type"], **arrays)
+
+
+def _goal(body: dict[str, Any]) -> Goal:
+    return Goal(
+        np.array(body["position"], np.float64),
+        np.array(body["wxyz"], np.float64),
+        Task(body["task"]),
+        float(body["tolerance"]),
+        float(body["tolerance_rot"]),
+    )

@@ -1,0 +1,273 @@
+"""Topics, schemas and the constant-size layouts of their messages.
+
+A layout is a template of bytes that holds every tag and length, and a dtype that says where the values go; encoding
+a thousand messages is then one copy of the template and one numpy assignment per field, decoding one view.
+"""
+
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+
+from rtctl.log.header import Header
+
+TICK = "/tick"
+JOINT_STATES = "/joint_states"
+EVENT = "/event"
+REQUEST = "/request"
+DROPOUT = "/log/dropout"
+SENTINEL = "/log/sentinel"
+POSITION = "/log/position"
+
+MESSAGE = np.dtype(  # a message record of MCAP up to its data
+    [("op", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
+
+# dtype format -> protobuf type, wire type (1 = 8 bytes, 5 = 4 bytes): only types of fixed width
+_FIXED = {
+    "<f8": (FieldDescriptorProto.TYPE_DOUBLE, 1),
+    "<f4": (FieldDescriptorProto.TYPE_FLOAT, 5),
+    "<u4": (FieldDescriptorProto.TYPE_FIXED32, 5),
+    "<u8": (FieldDescriptorProto.TYPE_FIXED64, 1),
+    "<i4": (FieldDescriptorProto.TYPE_SFIXED32, 5),
+    "<i8": (FieldDescriptorProto.TYPE_SFIXED64, 1),
+}
+
+JOINT_STATE_MSG = """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+class Layout(NamedTuple):
+    """Messages of one constant size."""
+
+    template: np.ndarray[Any, np.dtype[np.uint8]]  # (size,) a message whose values are zero
+    wire: np.dtype[np.void]  # the values, at their offsets in the message
+    tags: np.ndarray[Any, np.dtype[np.int64]]  # offsets of the bytes that are not values
+
+
+class Channel(NamedTuple):
+    """One topic of a log as it is written."""
+
+    id: int
+    topic: str
+    encoding: str
+    schema: str  # name
+    schema_encoding: str
+    schema_data: bytes
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+class _Builder:
+    """Grows a template and its dtype together."""
+
+    def __init__(self) -> None:
+        self.bytes = bytearray()
+        self.names: list[str] = []
+        self.formats: list[Any] = []
+        self.offsets: list[int] = []
+
+    def literal(self, data: bytes) -> None:
+        self.bytes += data
+
+    def value(self, name: str, format: Any) -> None:
+        self.names.append(name)
+        self.formats.append(format)
+        self.offsets.append(len(self.bytes))
+        self.bytes += bytes(np.dtype(format).itemsize)
+
+    def align(self, size: int, origin: int) -> None:
+        self.bytes += bytes(-(len(self.bytes) - origin) % size)
+
+    def layout(self) -> Layout:
+        wire = np.dtype(
+            {"names": self.names, "formats": self.formats, "offsets": self.offsets, "itemsize": len(self.bytes)}
+        )
+        literal = np.ones(len(self.bytes), dtype=bool)
+        for format, offset in zip(self.formats, self.offsets, strict=True):
+            literal[offset : offset + np.dtype(format).itemsize] = False
+        return Layout(np.frombuffer(bytes(self.bytes), np.uint8), wire, np.flatnonzero(literal))
+
+
+def tick_layout(dtype: np.dtype[np.void]) -> Layout:
+    """Return the layout of `rtctl.Tick`: field i of the record is protobuf field i + 1, arrays packed and flat.
+
+    Zeros are written too, which proto3 allows, so that the size is constant.
+    Raises ValueError for a field whose type has no fixed width.
+    """
+    builder = _Builder()
+    for number, (name, base, shape) in enumerate(_fields(dtype), start=1):
+        _, wire_type = _FIXED[base.str]
+        if shape:
+            size = base.itemsize * int(np.prod(shape))
+            builder.literal(_varint(number << 3 | 2) + _varint(size))
+        else:
+            builder.literal(_varint(number << 3 | wire_type))
+        builder.value(name, (base, shape))
+    return builder.layout()
+
+
+def tick_descriptor(dtype: np.dtype[np.void]) -> bytes:
+    """Return the serialized FileDescriptorSet of `rtctl.Tick`."""
+    message = DescriptorProto(name="Tick")
+    for number, (name, base, shape) in enumerate(_fields(dtype), start=1):
+        message.field.add(
+            name=name,
+            number=number,
+            type=_FIXED[base.str][0],
+            label=FieldDescriptorProto.LABEL_REPEATED if shape else FieldDescriptorProto.LABEL_OPTIONAL,
+        )
+    return _file("rtctl/tick.proto", message)
+
+
+def _fields(dtype: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], tuple[int, ...]]]:
+    fields = []
+    for name in dtype.names or ():
+        field = dtype[name]
+        if field.base.str not in _FIXED:
+            raise ValueError(f"field {name}: {field.base.str} has no fixed width in protobuf; known: {sorted(_FIXED)}")
+        fields.append((name, field.base, field.shape))
+    return fields
+
+
+def _file(name: str, message: DescriptorProto) -> bytes:
+    file = FileDescriptorProto(name=name, package="rtctl", syntax="proto3")
+    file.message_type.append(message)
+    data: bytes = FileDescriptorSet(file=[file]).SerializeToString()
+    return data
+
+
+_CAN = (  # name, protobuf type, bytes before the value, format
+    ("stamp_ns", FieldDescriptorProto.TYPE_FIXED64, b"\x09", "<u8"),  # monotonic clock
+    ("id", FieldDescriptorProto.TYPE_FIXED32, b"\x15", "<u4"),  # without the flag bits
+    ("dlc", FieldDescriptorProto.TYPE_FIXED32, b"\x1d", "<u4"),  # bytes of data, not the code of CAN FD
+    ("direction", FieldDescriptorProto.TYPE_ENUM, b"\x20", "u1"),
+    ("is_extended", FieldDescriptorProto.TYPE_BOOL, b"\x28", "u1"),
+    ("is_rtr", FieldDescriptorProto.TYPE_BOOL, b"\x30", "u1"),
+    ("is_error", FieldDescriptorProto.TYPE_BOOL, b"\x38", "u1"),
+    ("fd", FieldDescriptorProto.TYPE_BOOL, b"\x40", "u1"),
+    ("brs", FieldDescriptorProto.TYPE_BOOL, b"\x48", "u1"),
+    ("esi", FieldDescriptorProto.TYPE_BOOL, b"\x50", "u1"),
+    ("data", FieldDescriptorProto.TYPE_BYTES, b"\x5a", "u1"),
+)
+RX, TX = 0, 1
+CAN_DATA_AT = sum(len(tag) + np.dtype(format).itemsize for _, _, tag, format in _CAN)  # of a frame's first data byte
+
+
+def can_layout(size: int) -> Layout:
+    """Return the layout of an `rtctl.CanFrame` with `size` (0..64) bytes of data."""
+    builder = _Builder()
+    for name, _, tag, format in _CAN[:-1]:
+        builder.literal(tag)
+        builder.value(name, format)
+    builder.literal(_CAN[-1][2] + _varint(size))
+    builder.value("data", ("u1", (size,)))
+    return builder.layout()
+
+
+def can_descriptor() -> bytes:
+    """Return the serialized FileDescriptorSet of `rtctl.CanFrame`."""
+    message = DescriptorProto(name="CanFrame")
+    direction = message.enum_type.add(name="Direction")
+    direction.value.add(name="RX", number=RX)
+    direction.value.add(name="TX", number=TX)
+    for name, kind, tag, _ in _CAN:
+        type_name = ".rtctl.CanFrame.Direction" if kind == FieldDescriptorProto.TYPE_ENUM else None
+        label = FieldDescriptorProto.LABEL_OPTIONAL
+        message.field.add(name=name, number=tag[0] >> 3, type=kind, label=label, type_name=type_name)
+    return _file("rtctl/can_frame.proto", message)
+
+
+def joint_state_layout(names: tuple[str, ...]) -> Layout:
+    """Return the layout of a little-endian CDR `sensor_msgs/msg/JointState` of these joints."""
+    builder = _Builder()
+    builder.literal(b"\x00\x01\x00\x00")  # CDR, little endian; alignment counts from behind these
+    builder.value("sec", "<i4")
+    builder.value("nanosec", "<u4")
+    _cdr_string(builder, "")
+    builder.align(4, 4)
+    builder.literal(len(names).to_bytes(4, "little"))
+    for name in names:
+        builder.align(4, 4)
+        _cdr_string(builder, name)
+    for field in ("position", "velocity", "effort"):
+        builder.align(4, 4)
+        builder.literal(len(names).to_bytes(4, "little"))
+        if names:
+            builder.align(8, 4)
+        builder.value(field, ("<f8", (len(names),)))
+    return builder.layout()
+
+
+def _cdr_string(builder: _Builder, text: str) -> None:
+    data = text.encode() + b"\0"
+    builder.literal(len(data).to_bytes(4, "little") + data)
+
+
+def _json_schema(title: str, properties: dict[str, Any], required: tuple[str, ...] = ()) -> bytes:
+    schema = {"title": title, "type": "object", "properties": properties, "required": list(required)}
+    return json.dumps(schema).encode()
+
+
+_INTEGER, _STRING, _OBJECT = {"type": "integer"}, {"type": "string"}, {"type": "object"}
+_LOG_SCHEMA = _json_schema(
+    "foxglove.Log",
+    {
+        "timestamp": {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}},
+        "level": {"type": "integer", "description": "1 debug, 2 info, 3 warning, 4 error, 5 fatal"},
+        "message": _STRING,
+        "name": _STRING,
+        "file": _STRING,
+        "line": _INTEGER,
+        "data": {"type": "object", "description": "the event as the controller put it"},
+    },
+)
+_REQUEST_SCHEMA = _json_schema(
+    "rtctl.Request", {"tick": _INTEGER, "verb": _INTEGER, "goal": _OBJECT, "obstacles": {"type": "array"}}, ("tick",)
+)
+_DROPOUT_SCHEMA = _json_schema("rtctl.Dropout", {"count": _INTEGER, "from_ns": _INTEGER, "to_ns": _INTEGER}, ("count",))
+_SENTINEL_SCHEMA = _json_schema("rtctl.Sentinel", {"reason": _STRING, "detail": _STRING}, ("reason",))
+_POSITION_SCHEMA = _json_schema("rtctl.Position", {"entries": _INTEGER}, ("entries",))
+
+
+def channels(header: Header) -> tuple[Channel, ...]:
+    """Return the channels of a log, each with its schema; ids are 1, 2, 3 ..."""
+    tick = tick_descriptor(header.dtype)
+    can = can_descriptor()
+    rows = [
+        (TICK, "protobuf", "rtctl.Tick", "protobuf", tick),
+        (JOINT_STATES, "cdr", "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE_MSG.encode()),
+        (EVENT, "json", "foxglove.Log", "jsonschema", _LOG_SCHEMA),
+        (REQUEST, "json", "rtctl.Request", "jsonschema", _REQUEST_SCHEMA),
+        (DROPOUT, "json", "rtctl.Dropout", "jsonschema", _DROPOUT_SCHEMA),
+        (SENTINEL, "json", "rtctl.Sentinel", "jsonschema", _SENTINEL_SCHEMA),
+        (POSITION, "json", "rtctl.Position", "jsonschema", _POSITION_SCHEMA),
+    ]
+    rows += [(can_topic(bus), "protobuf", "rtctl.CanFrame", "protobuf", can) for bus in header.buses]
+    return tuple(Channel(number, *row) for number, row in enumerate(rows, start=1))
+
+
+def can_topic(bus: str) -> str:
+    """Return the topic of a bus."""
+    return f"/can/{bus}"
