@@ -1,0 +1,155 @@
+"""Asking a running daemon: one JSON object out, one back, over its control socket. Standard library alone."""
+
+import errno
+import json
+import os
+import socket
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rtctl.errors import LinkError, RequestError, UsageError
+
+MESSAGE_MAX = 64 * 1024  # bytes, both ways
+RETRY = 0.005  # [s] between two attempts when the daemon's queue of callers is full
+
+
+def socket_folders() -> list[Path]:
+    """Return the folders where daemons of this user or of the system put their control sockets, most specific first."""
+    folders = []
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    if runtime:
+        folders.append(Path(runtime))
+    folders.append(Path(f"/tmp/rtctl-{os.getuid()}"))
+    folders.append(Path("/run/rtctl"))  # RuntimeDirectory of the shipped unit
+    return folders
+
+
+def default_path(robot: str) -> str:
+    """Return where the daemon of `robot` listens when its config names no socket."""
+    service = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # set by systemd
+    folder = Path(service) if service else socket_folders()[0]
+    return str(folder / f"rtctl-{robot}.sock")
+
+
+def find(robot: str = "") -> str:
+    """Return the socket of `robot`, or of the only daemon there is.
+
+    Raises LinkError when there is none, UsageError when it takes a name to choose.
+    """
+    pattern = f"rtctl-{robot}.sock" if robot else "rtctl-*.sock"
+    places = [place for folder in socket_folders() for place in (folder, *_subfolders(folder))]
+    found = sorted({str(path) for place in places for path in place.glob(pattern) if path.is_socket()})
+    alive = [path for path in found if answers(path)]
+    if len(alive) == 1:
+        return alive[0]
+    if not alive:
+        looked = ", ".join(str(folder) for folder in socket_folders())
+        raise LinkError(f"no daemon {'of ' + robot + ' ' if robot else ''}is running: no {pattern} answers in {looked}")
+    raise UsageError(f"several daemons run: choose one by --socket PATH or --robot NAME: {', '.join(alive)}")
+
+
+def answers(path: str) -> bool:
+    """Return whether somebody listens at `path`; a socket file outlives a killed process."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as probe:
+        code = probe.connect_ex(path)
+    return code in (0, errno.EAGAIN, errno.EACCES)  # queue full, or not for us to talk to: alive all the same
+
+
+class Session:
+    """A connection to the daemon that serves many questions."""
+
+    def __init__(self, path: str, timeout: float = 2.0) -> None:
+        """Connect within `timeout` [s]; it also bounds each answer. Raises LinkError."""
+        self.path, self.timeout = path, timeout
+        self._socket = _connect(path, timeout)
+
+    def ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Return the daemon's reply. Raises LinkError when none comes, RequestError when `message` is too large."""
+        try:
+            data = json.dumps(message, allow_nan=False).encode()
+        except ValueError as error:  # nan and infinity are not JSON
+            raise RequestError(f"not a request: {error}") from None
+        if len(data) > MESSAGE_MAX:
+            raise RequestError(f"a request of {len(data)} bytes, at most {MESSAGE_MAX} are taken")
+        try:
+            raw = self._exchange(data)
+        except TimeoutError:
+            raise LinkError(f"{self.path}: no answer within {self.timeout:g} s") from None
+        except OSError as error:
+            raise LinkError(f"{self.path}: {error.strerror}") from None
+        if not raw:
+            raise LinkError(f"{self.path}: the daemon closed the connection")
+        try:
+            reply = json.loads(raw)
+        except ValueError:
+            reply = None
+        if not isinstance(reply, dict):
+            raise LinkError(f"{self.path}: not a reply of rtctl: {raw[:60]!r}")
+        return reply
+
+    def _exchange(self, data: bytes) -> bytes:
+        with suppress(BrokenPipeError):  # hung up on already: its reason may wait to be read
+            self._socket.send(data)
+        try:
+            return self._socket.recv(MESSAGE_MAX)
+        except ConnectionResetError:  # said before the last words that were sent; they come after it
+            return self._socket.recv(MESSAGE_MAX)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def ask(path: str, message: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
+    """Return the reply of the daemon at `path` to one `message`. Raises LinkError."""
+    with Session(path, timeout) as session:
+        return session.ask(message)
+
+
+def demand(path: str, message: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
+    """Return the reply to `message` if the daemon did it. Raises RequestError with the daemon's reason, LinkError."""
+    return accepted(ask(path, message, timeout))
+
+
+def accepted(reply: dict[str, Any]) -> dict[str, Any]:
+    """Return `reply` if it says yes. Raises RequestError with the daemon's reason."""
+    if reply.get("ok") is not True:
+        raise RequestError(f"refused: {reply.get('error', 'without a reason')}")
+    return reply
+
+
+def _connect(path: str, timeout: float) -> socket.socket:
+    """Connect, waiting while the daemon's queue of callers is full."""
+    deadline = time.monotonic() + timeout
+    while True:
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+        link.setblocking(False)
+        try:
+            code = link.connect_ex(path)
+        except OSError as error:  # a path too long for an address
+            link.close()
+            raise LinkError(f"{path}: {error}") from None
+        if code == 0:
+            link.settimeout(timeout)
+            return link
+        link.close()
+        if code != errno.EAGAIN or time.monotonic() >= deadline:
+            what = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "no daemon is listening"}
+            raise LinkError(f"{path}: {what.get(code, os.strerror(code))}")
+        time.sleep(RETRY)
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    """Return the folders of the unit's instances below /run/rtctl; elsewhere sockets lie flat."""
+    return [path for path in folder.glob("*") if path.is_dir()] if folder == Path("/run/rtctl") else []
