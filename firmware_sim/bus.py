@@ -1,0 +1,235 @@
+"""The bus the drives sit on: a hub of Unix sockets that needs no kernel support, or SocketCAN.
+
+Both carry whole `struct can_frame` and `struct canfd_frame`, one a packet; both send or drop, and never block but in
+`receive`.
+"""
+
+import errno
+import os
+import select
+import socket
+import struct
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol
+
+from firmware_sim.settings import SettingsError
+
+FRAME_MAX = 80  # above the 72 bytes of the longest frame
+PEERS_MAX = 16
+BATCH = 64  # frames of one peer in one go: a flooding peer must not starve the clock
+REOPEN_S = 1.0
+
+
+class Bus(Protocol):
+    """What the drives need of a bus."""
+
+    name: str
+    dropped: int
+
+    def receive(self, timeout: float) -> list[bytes]: ...  # everything that waits, after at most `timeout` [s]
+
+    def send(self, frames: Iterable[bytes]) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def socket_path(channel: str) -> str:
+    """Return a path for `channel`: itself, or a bare name in the user's run-time folder."""
+    folder = os.environ.get("XDG_RUNTIME_DIR") or "/tmp"
+    return channel if "/" in channel else str(Path(folder) / f"rtctl-{channel}.can")
+
+
+def open_bus(interface: str, channel: str, ids: Iterable[int]) -> Bus:
+    """Open the bus the robot file names; `ids` are those the drives listen to. SettingsError if it cannot be."""
+    if interface == "socketpair":
+        return Hub(socket_path(channel))
+    if interface == "socketcan":
+        return SocketCan(channel, ids)
+    raise SettingsError(f"link.interface {interface}: drives can be simulated on socketpair or socketcan")
+
+
+class Hub:
+    """Listens at a path; every frame of a peer goes to all other peers, and to the drives."""
+
+    def __init__(self, path: str) -> None:
+        self.name, self.dropped = path, 0
+        self._claim(path)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        old = os.umask(0o177)  # this user only
+        try:
+            self._listener.bind(path)
+        except OSError as error:
+            self._listener.close()
+            raise SettingsError(f"{path}: {error.strerror or error}") from error
+        finally:
+            os.umask(old)
+        self._listener.listen(PEERS_MAX)
+        self._inode = os.stat(path).st_ino
+        self._peers: dict[int, socket.socket] = {}
+
+    @staticmethod
+    def _claim(path: str) -> None:
+        """Remove the socket a dead simulator left behind; refuse one that is served, and anything that is no socket."""
+        if not os.path.lexists(path):
+            return
+        if not Path(path).is_socket():
+            raise SettingsError(f"{path}: is there and is no socket")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as probe:
+            if probe.connect_ex(path) in (0, errno.EAGAIN):
+                raise SettingsError(f"{path}: this bus is served already")
+        os.unlink(path)
+
+    def receive(self, timeout: float) -> list[bytes]:
+        """Return what came from all peers within `timeout` [s], each one's frames in order; the others get it too.
+
+        `select`, because Python's `epoll` rounds its time-out up to whole milliseconds.
+        """
+        frames: list[bytes] = []
+        for source in select.select([self._listener, *self._peers.values()], [], [], timeout)[0]:
+            if source is self._listener:
+                self._accept()
+            elif source.fileno() in self._peers:  # forwarding may have shown that it is gone
+                frames += self._drain(source.fileno())
+        return frames
+
+    def _accept(self) -> None:
+        try:
+            peer, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(self._peers) >= PEERS_MAX:
+            peer.close()
+            return
+        peer.setblocking(False)
+        self._peers[peer.fileno()] = peer
+
+    def _drain(self, fd: int) -> list[bytes]:
+        frames: list[bytes] = []
+        peer = self._peers[fd]
+        for _ in range(BATCH):
+            try:
+                raw = peer.recv(FRAME_MAX)
+            except BlockingIOError:
+                break
+            except OSError:
+                raw = b""
+            if not raw:
+                self._leave(fd)
+                break
+            if len(raw) in (16, 72):
+                frames.append(raw)
+        if len(self._peers) > 1:
+            self._spread(frames, fd)
+        return frames
+
+    def _leave(self, fd: int) -> None:
+        self._peers.pop(fd).close()
+
+    def send(self, frames: Iterable[bytes]) -> None:
+        """Send frames to every peer; one that does not read loses them."""
+        self._spread(list(frames), -1)
+
+    def _spread(self, frames: list[bytes], source: int) -> None:
+        for fd, peer in list(self._peers.items()):
+            if fd == source:
+                continue
+            for raw in frames:
+                try:
+                    peer.send(raw)
+                except BlockingIOError:
+                    self.dropped += 1
+                except OSError:
+                    self._leave(fd)
+                    break
+
+    def close(self) -> None:
+        """Hang up and take the path away, unless somebody else has taken it over."""
+        for fd in list(self._peers):
+            self._leave(fd)
+        self._listener.close()
+        try:
+            if os.stat(self.name).st_ino == self._inode:
+                os.unlink(self.name)
+        except FileNotFoundError:
+            pass
+
+
+class SocketCan:
+    """A raw CAN socket; opened anew each second after its interface went away."""
+
+    def __init__(self, channel: str, ids: Iterable[int]) -> None:
+        self.name, self.dropped = channel, 0
+        self._ids = tuple(ids)
+        self._retry = 0.0
+        try:
+            self._socket: socket.socket | None = self._open()
+        except OSError as error:
+            raise SettingsError(f"{channel}: cannot be opened as a SocketCAN interface: {error}") from error
+
+    def _open(self) -> socket.socket:
+        if not hasattr(socket, "AF_CAN"):
+            raise OSError("this system has no AF_CAN")
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        try:
+            sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+            mask = socket.CAN_SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
+            filters = b"".join(struct.pack("=II", i, mask) for i in self._ids)
+            sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+            sock.bind((self.name,))
+        except OSError:
+            sock.close()
+            raise
+        sock.setblocking(False)
+        return sock
+
+    def receive(self, timeout: float) -> list[bytes]:
+        """Return what came within `timeout` [s]."""
+        if self._socket is None:
+            self._reopen(timeout)
+            return []
+        frames: list[bytes] = []
+        try:
+            if not select.select([self._socket], [], [], timeout)[0]:
+                return []
+            while len(frames) < BATCH:
+                frames.append(self._socket.recv(FRAME_MAX))
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            self._fail(error)
+        return frames
+
+    def _fail(self, error: OSError) -> None:
+        """Give up a socket whose interface is gone; one that is merely down comes back by itself."""
+        if error.errno in (errno.ENODEV, errno.ENXIO, errno.EBADF) and self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _reopen(self, timeout: float) -> None:
+        time.sleep(timeout)
+        if time.monotonic() >= self._retry:
+            self._retry = time.monotonic() + REOPEN_S
+            try:
+                self._socket = self._open()
+            except OSError:
+                self._socket = None
+
+    def send(self, frames: Iterable[bytes]) -> None:
+        """Send frames, or drop what the interface does not take."""
+        for raw in frames:
+            if self._socket is None:
+                self.dropped += 1
+                continue
+            try:
+                self._socket.send(raw)
+            except OSError as error:
+                self.dropped += 1
+                self._fail(error)
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None

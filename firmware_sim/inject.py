@@ -1,0 +1,136 @@
+"""Faults on demand, by name and time: what drives, sensors and bus do when they go wrong.
+
+`kind@t[:joint[:duration]]` on the command line, `[[fault]]` tables in a scenario. A joint is a name or an index from 0;
+without one the fault holds for every joint. Without a duration, or with 0, it lasts.
+"""
+
+import random
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from firmware_sim.drive import NS, Drive
+from firmware_sim.drive import Fault as Code
+from firmware_sim.settings import SettingsError
+
+KINDS = {
+    "drive_fault": "the drive latches an over-current fault",
+    "overheat": "the winding is at its trip temperature",
+    "hot": "the winding is half way into derating",
+    "watchdog": "commands are lost on their way to the drive",
+    "silent": "the drive takes commands, its replies are lost",
+    "drop": "commands and replies are lost, each with probability 1/2",
+    "duplicate": "every reply comes twice",
+    "corrupt_crc": "one bit of every reply is flipped",
+    "corrupt_command": "one bit of every command is flipped",
+    "stuck_encoder": "the encoder repeats its last value",
+    "encoder_jump": "the encoder is off by 0.5 rad",
+    "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
+}
+FOREVER = 1 << 62
+JUMP = 0.5  # [rad]
+
+
+class Fault(NamedTuple):
+    """One fault: what, when [ns], and which joint (-1 = all)."""
+
+    kind: str
+    start: int
+    end: int
+    joint: int
+
+
+def _joint(value: Any, names: Sequence[str]) -> int:
+    if value in (None, "", -1):
+        return -1
+    text = str(value)
+    k = names.index(text) if text in names else int(text) if text.isdigit() else len(names)
+    if k >= len(names):
+        raise SettingsError(f"fault: joint {text} is not one of {', '.join(names)}")
+    return k
+
+
+def _fault(kind: str, at_s: float, joint: Any, duration_s: float | None, names: Sequence[str]) -> Fault:
+    if kind not in KINDS:
+        raise SettingsError(f"fault: {kind} is not one of {', '.join(KINDS)}")
+    start = round(at_s * NS)
+    end = start + round(duration_s * NS) if duration_s else FOREVER
+    return Fault(kind, start, end, _joint(joint, names))
+
+
+def faults_of(tables: Iterable[dict[str, Any]], names: Sequence[str]) -> list[Fault]:
+    """Return the faults of a scenario's [[fault]] tables."""
+    return [_fault(t["kind"], float(t["at_s"]), t.get("joint"), t.get("duration_s"), names) for t in tables]
+
+
+def parse(text: str, names: Sequence[str]) -> Fault:
+    """Read `kind@t[:joint[:duration]]`; SettingsError says what would have been right."""
+    kind, _, rest = text.partition("@")
+    parts = rest.split(":")
+    try:
+        duration = float(parts[2]) if len(parts) > 2 else None
+        return _fault(kind, float(parts[0]), parts[1] if len(parts) > 1 else None, duration, names)
+    except ValueError as error:
+        raise SettingsError(f"--inject {text}: wanted kind@seconds[:joint[:seconds]]") from error
+
+
+class Injector:
+    """Holds the faults of a run; reproducible from its seed."""
+
+    def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
+        self.faults = list(faults)
+        self.random = random.Random(seed)
+        self.done: set[int] = set()
+        self.stuck: dict[int, tuple[float, float]] = {}
+
+    def active(self, kind: str, now: int, joint: int) -> bool:
+        """Tell whether a fault of this kind holds for a joint at time `now` [ns]."""
+        return any(f.kind == kind and f.start <= now < f.end and f.joint in (-1, joint) for f in self.faults)
+
+    def command(self, now: int, joint: int, data: bytes) -> bytes | None:
+        """Return what of a command reaches the drive, None if nothing."""
+        if not self.faults:
+            return data
+        if self.active("watchdog", now, joint) or (self.active("drop", now, joint) and self.random.random() < 0.5):
+            return None
+        return self._flipped(data) if self.active("corrupt_command", now, joint) else data
+
+    def reply(self, now: int, joint: int, data: bytes) -> list[bytes]:
+        """Return what of a reply reaches the bus."""
+        if not self.faults:
+            return [data]
+        if self.active("silent", now, joint) or (self.active("drop", now, joint) and self.random.random() < 0.5):
+            return []
+        if self.active("corrupt_crc", now, joint):
+            data = self._flipped(data)
+        return [data, data] if self.active("duplicate", now, joint) else [data]
+
+    def _flipped(self, data: bytes) -> bytes:
+        bit = self.random.randrange(len(data) * 8)
+        return data[: bit // 8] + bytes((data[bit // 8] ^ 1 << bit % 8,)) + data[bit // 8 + 1 :]
+
+    def encoder(self, now: int, joint: int, q: float, qd: float) -> tuple[float, float]:
+        """Return what the encoder reads of the true q [rad], qd [rad/s]."""
+        if not self.faults:
+            return q, qd
+        if self.active("stuck_encoder", now, joint):
+            return self.stuck.setdefault(joint, (q, qd))
+        self.stuck.pop(joint, None)
+        return (q + JUMP, qd) if self.active("encoder_jump", now, joint) else (q, qd)
+
+    def apply(self, now: int, drives: Sequence[Drive]) -> None:
+        """Let the faults that happen inside a drive happen, once each, or for as long as they last where they heat."""
+        for k, f in enumerate(self.faults):
+            if not f.start <= now < f.end or (k in self.done and f.kind not in ("overheat", "hot")):
+                continue
+            self.done.add(k)
+            for joint, drive in enumerate(drives):
+                if f.joint not in (-1, joint):
+                    continue
+                if f.kind == "drive_fault":
+                    drive.trip(Code.OVER_CURRENT)
+                elif f.kind == "overheat":
+                    drive.temperature = 125.0
+                elif f.kind == "hot":
+                    drive.temperature = 110.0
+                elif f.kind == "reboot":
+                    drive.boot()
