@@ -1,0 +1,69 @@
+"""The command `rtctl`: parsers here, work in the modules beside; nothing heavy is imported before it is needed."""
+
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+from rtctl.cli import logs, offline, operate
+from rtctl.cli.parser import Parser
+from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
+
+EXAMPLES = """example:
+  rtctl check configs/panda.toml
+  rtctl run configs/panda.toml &
+  rtctl arm && rtctl goal 0.45 0.20 0.40 --wait && rtctl status
+"""
+
+
+def build_parser() -> Parser:
+    """Return the parser of the whole command line; each command carries its function as `work`."""
+    parser = Parser(
+        prog="rtctl",
+        description="Torque control of arms in operational space, with obstacle avoidance, over CAN.",
+        epilog=EXAMPLES + "\nNot safety-rated: a hardware emergency stop is required.",
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = parser.add_subparsers(metavar="COMMAND", dest="command")
+    offline.add_before(commands)
+    operate.add(commands)
+    offline.add_after(commands)
+    logs.add(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit code: 0, 1 failed, 2 wrong call, 78 refused config."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without our letters shows others, no traceback
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        code = _run(sys.argv[1:] if argv is None else list(argv))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the interpreter's own flush at exit must not fail again
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        return EXIT_FAILED
+    except RtctlError as error:
+        return _report(str(error), error.exit_code)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return _report(f"{place}{error.strerror or error}", EXIT_FAILED)
+
+
+def _run(argv: list[str]) -> int:
+    arguments = build_parser().parse_args(argv)
+    if arguments.version:
+        from rtctl import __version__
+
+        print(f"rtctl {__version__}")
+        return EXIT_OK
+    if arguments.command is None:
+        raise UsageError("no command (see rtctl --help)")
+    return int(arguments.work(arguments))
+
+
+def _report(text: str, code: int) -> int:
+    print(f"rtctl: {' '.join(text.split())}", file=sys.stderr)
+    return code

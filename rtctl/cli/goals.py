@@ -1,0 +1,106 @@
+"""Sending goals and following them to their end."""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from rtctl.cli.values import goal_messages
+from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError
+from rtctl.hal.client import Session, accepted
+
+POLL = 0.05  # [s] between two looks at the status
+ARRIVED = "arrived"
+MOVING_STATES = ("ARMED", "RUN")
+
+
+class Outcome(NamedTuple):
+    """What became of a goal."""
+
+    position: list[float]  # (3,) [m]
+    arrived: bool
+    why: str  # the status, state or refusal that ended it
+    time: float  # [s]
+    error: float  # [m] to the goal, nan where unknown
+    error_rot: float  # [rad]
+
+    def show(self, as_json: bool) -> None:
+        """Print one line."""
+        if as_json:
+            print(json.dumps(self.as_dict()), flush=True)
+            return
+        where = " ".join(f"{c:+.3f}" for c in self.position)
+        word = "arrived" if self.arrived else f"NOT REACHED: {self.why}"
+        print(f"goal {where} m  {word}  {self.time:.2f} s  {_figure(self.error, 1e3, 'mm')}", flush=True)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome for --json; what is unknown is null."""
+        known = {key: None if math.isnan(value) else value for key, value in self._errors().items()}
+        return {"position_m": self.position, "arrived": self.arrived, "why": self.why, "time_s": self.time, **known}
+
+    def _errors(self) -> dict[str, float]:
+        return {"error_m": self.error, "error_rad": self.error_rot}
+
+
+def send(session: Session, message: dict[str, Any]) -> dict[str, Any]:
+    """Return the daemon's reply. Raises RequestError with its reason."""
+    return accepted(session.ask(message))
+
+
+def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> Outcome:
+    """Return what became of a goal within `timeout` [s]. Raises RequestError when it is refused at once."""
+    send(session, message)
+    wanted, begin = message["position_m"], time.monotonic()
+    while True:
+        status = accepted(session.ask({"verb": "status"}))  # made after the goal was taken: never of the one before
+        why = _end(status, wanted)
+        elapsed = time.monotonic() - begin
+        if not why and elapsed > timeout:
+            why = f"{status.get('status', '?')} {status.get('detail') or ''} after {timeout:g} s".replace("  ", " ")
+        if why:
+            errors = [_known(status.get(key)) for key in ("error_m", "error_rad")]
+            return Outcome(list(wanted), why == ARRIVED, why, elapsed, *errors)
+        time.sleep(POLL)
+
+
+def run_stream(session: Session, lines: Iterable[str], source: str, arguments: argparse.Namespace) -> int:
+    """Send the goals in `lines` one after another and return the exit code. Raises UsageError, RequestError."""
+    failed = 0
+    for at, message in goal_messages(lines, source):
+        try:
+            if arguments.rate:
+                send(session, message)
+                time.sleep(1.0 / arguments.rate)
+                continue
+            outcome = send_and_wait(session, message, arguments.timeout)
+        except RequestError as error:
+            if not arguments.keep_going:
+                raise RequestError(f"{source}:{at}: {error}") from None
+            outcome = Outcome(message["position_m"], False, str(error), 0.0, math.nan, math.nan)
+        outcome.show(arguments.json)
+        failed += not outcome.arrived
+        if failed and not arguments.keep_going:
+            break
+    return EXIT_FAILED if failed else EXIT_OK
+
+
+def _end(status: dict[str, Any], wanted: list[float]) -> str:
+    """Return why the goal is over, or nothing while it is pursued."""
+    state = str(status.get("state"))
+    if state not in MOVING_STATES:
+        faults = ", ".join(map(str, status.get("faults") or ()))
+        return f"{state}{': ' + faults if faults else ''}"
+    present = status.get("goal_m")
+    if present is None or any(abs(a - b) > 1e-6 for a, b in zip(present, wanted, strict=True)):
+        return "replaced by another goal"
+    return ARRIVED if status.get("status") == ARRIVED else ""
+
+
+def _known(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _figure(value: float, scale: float, unit: str) -> str:
+    return "" if math.isnan(value) else f"error {value * scale:.2f} {unit}"

@@ -1,0 +1,116 @@
+"""Commands that need no running daemon: check, run, sim, schema, doctor, bench."""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from rtctl.cli.parser import Commands, command
+from rtctl.errors import EXIT_OK, UsageError
+
+
+def add_before(commands: Commands) -> None:
+    """Add what comes before operating: check and run."""
+    check = command(
+        commands, "check", "validate a config and print the derived robot", "rtctl check configs/panda.toml", _check
+    )
+    check.add_argument("config", metavar="CONFIG")
+    check.add_argument("--json", action="store_true", help="print one JSON object")
+    run = command(commands, "run", "run the daemon in the foreground", "rtctl run configs/panda.toml --dry", _run)
+    run.add_argument("config", metavar="CONFIG")
+    run.add_argument("--dry", action="store_true", help="compute and log, but send stop frames alone")
+    run.add_argument("--lockstep", action="store_true", help="wait for the drives' replies instead of the clock")
+
+
+def add_after(commands: Commands) -> None:
+    """Add what is done beside operating: simulation, schema, the machine."""
+    sim = command(
+        commands,
+        "sim",
+        "play a scenario: controller and virtual robot in one process",
+        "rtctl sim scenarios/demo.toml --json --log demo.mcap",
+        _sim,
+    )
+    sim.add_argument("scenario", metavar="SCENARIO")
+    sim.add_argument("--json", action="store_true", help="print one JSON object")
+    sim.add_argument("--log", metavar="FILE", default="", help="write an MCAP log")
+    sim.add_argument("--realtime", action="store_true", help="no faster than the clock")
+    schema = command(
+        commands, "schema", "print a JSON Schema, for editors", "rtctl schema config > configs/schema.json", _schema
+    )
+    schema.add_argument("what", choices=("config", "scenario", "request"), nargs="?", default="config", metavar="WHAT")
+    schema.description = "Print the JSON Schema of WHAT: config (default), scenario, or request to the control socket."
+    doctor = command(commands, "doctor", "can this machine do it", "rtctl doctor --json", _doctor)
+    doctor.add_argument("--json", action="store_true", help="print one JSON object")
+    doctor.add_argument(
+        "--wakes", metavar="N", type=int, default=1000, help="wake-ups to measure (%(default)s, 1 ms each)"
+    )
+    bench = command(commands, "bench", "measure the speed figures on this machine", "rtctl bench", _bench)
+    bench.add_argument("arguments", metavar="ARG", nargs="*", help="passed on to tools/bench.py, after --")
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from rtctl import config
+
+    loaded = config.load(arguments.config)
+    report = config.check(loaded, config.build(loaded, arguments.config))
+    print(json.dumps(report.as_dict()) if arguments.json else report.render())
+    return EXIT_OK
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from rtctl.daemon import run
+
+    return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry)
+
+
+def _sim(arguments: argparse.Namespace) -> int:
+    from rtctl.sim import simulate
+
+    result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
+    if arguments.json:
+        print(json.dumps(result))
+    else:
+        from rtctl.cli.summary import show
+
+        show(result, arguments.scenario, arguments.log)
+    return EXIT_OK
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    print(json.dumps(_schema_of(arguments.what), indent=2))
+    return EXIT_OK
+
+
+def _schema_of(what: str) -> dict[str, Any]:
+    from rtctl import config
+
+    if what == "config":
+        return config.json_schema()
+    import msgspec
+
+    from rtctl.config.scenario import Scenario
+    from rtctl.hal.messages import Message
+
+    schema = msgspec.json.schema(Scenario if what == "scenario" else Message)
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"rtctl {what}"}
+    return dict(msgspec.json.decode(msgspec.json.encode({**head, **schema})))  # tuples become the lists of JSON
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from rtctl.hal import doctor
+
+    if not 10 <= arguments.wakes <= 1_000_000:
+        raise UsageError(f"--wakes: got {arguments.wakes}, wanted 10 to 1000000")
+    rows = doctor.examine(wakes=arguments.wakes)
+    print(json.dumps(doctor.as_dict(rows)) if arguments.json else doctor.render(rows))
+    return doctor.exit_code(rows)
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    root = Path(__file__).parents[2]
+    if not (root / "tools" / "bench.py").is_file():
+        raise UsageError("bench: tools/bench.py is part of the source tree, which this installation lacks")
+    return subprocess.run([sys.executable, "-m", "tools.bench", *arguments.arguments], cwd=root, check=False).returncode

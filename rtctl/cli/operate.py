@@ -1,0 +1,164 @@
+"""Commands to a running daemon, over its control socket."""
+
+import argparse
+import json
+import sys
+import time
+from typing import Any
+
+from rtctl.cli.parser import Commands, Parser, add_daemon, command, daemon_of, number, positive
+from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError
+
+VERBS = {
+    "arm": "enable the drives; the arm holds where it is",
+    "disarm": "come to rest, then disable the drives",
+    "stop": "brake now; only an operator's reset leaves the stop",
+    "reset": "leave a latched stop or fault, once its cause is gone",
+    "recover": "allow a slow move inward from beyond a joint limit",
+}
+WATCH_PERIOD = 0.1  # [s]
+EVERYTHING = "*"
+
+
+def add(commands: Commands) -> None:
+    """Add the operator's commands."""
+    for verb, text in VERBS.items():
+        add_daemon(command(commands, verb, text, f"rtctl {verb} --robot panda", _verb))
+    example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
+    goal = command(commands, "goal", "send the tip to a position [m], or a pose", example, _goal)
+    for axis in "xyz":
+        goal.add_argument(axis, metavar=axis.upper(), type=number, help="in the world frame [m]")
+    turn = goal.add_mutually_exclusive_group()
+    turn.add_argument("--rpy", metavar=("R", "P", "Y"), nargs=3, type=number, help="roll, pitch, yaw [rad]")
+    turn.add_argument("--wxyz", metavar=("W", "X", "Y", "Z"), nargs=4, type=number, help="unit quaternion")
+    turn.add_argument("--hold-orientation", action="store_true", help="keep the present orientation")
+    goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
+    _add_waiting(goal)
+    goal.add_argument("--wait", action="store_true", help="return when the tip has arrived; exit code 1 if it does not")
+    goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
+    goals.description = (
+        "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
+        'x,y,z,w,x,y,z; under a header of such names; or JSON: {"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
+    )
+    goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
+    _add_waiting(goals)
+    goals.add_argument("--rate", metavar="HZ", type=positive, help="send at this rate without waiting for arrival")
+    goals.add_argument("--keep-going", action="store_true", help="go on after a goal that was refused or not reached")
+    _add_obstacle(commands)
+    status = command(commands, "status", "show how things stand", "rtctl status --watch", _status)
+    status.add_argument("--watch", action="store_true", help="keep showing, ten times a second")
+    status.add_argument("--json", action="store_true", help="print the daemon's reply; with --watch one a line")
+    add_daemon(status)
+
+
+def _add_waiting(parser: Parser) -> None:
+    parser.add_argument("--timeout", metavar="S", type=positive, default=30.0, help="to arrive, a goal (%(default)s s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per goal")
+    add_daemon(parser)
+
+
+def _add_obstacle(commands: Commands) -> None:
+    parser = command(
+        commands,
+        "obstacle",
+        "set or clear an obstacle",
+        "rtctl obstacle set ball sphere radius_m=0.05 position_m=0.4,0,0.5 velocity_m_s=0,0.1,0\n"
+        "  rtctl obstacle clear ball",
+    )
+    actions = parser.add_subparsers(metavar="ACTION", dest="action", required=True)
+    example = "rtctl obstacle set crate box size_m=0.2,0.2,0.1 position_m=0.5,0,0.05"
+    setter = command(actions, "set", "put an obstacle, or move it", example, _set)
+    setter.add_argument("name", metavar="NAME")
+    setter.add_argument("type", metavar="TYPE", help="sphere, box, capsule, plane, ellipsoid, … as in a scenario")
+    setter.add_argument("keys", metavar="KEY=VALUE", nargs="*", help="as in a scenario's [[obstacle]]; lists by commas")
+    add_daemon(setter)
+    clear = command(actions, "clear", "forget an obstacle", "rtctl obstacle clear --all", _clear)
+    which = clear.add_mutually_exclusive_group(required=True)
+    which.add_argument("name", metavar="NAME", nargs="?", default="")
+    which.add_argument("--all", action="store_true", help="forget all, the config's own included")
+    add_daemon(clear)
+
+
+def _demand(arguments: argparse.Namespace, message: dict[str, Any]) -> dict[str, Any]:
+    from rtctl.hal.client import demand
+
+    return demand(daemon_of(arguments), message, arguments.reply)
+
+
+def _said(reply: dict[str, Any], default: str) -> int:
+    print(reply.get("text") or default)
+    return EXIT_OK
+
+
+def _verb(arguments: argparse.Namespace) -> int:
+    return _said(_demand(arguments, {"verb": arguments.command}), f"{arguments.command}: accepted")
+
+
+def _set(arguments: argparse.Namespace) -> int:
+    from rtctl.cli.values import assignments
+
+    described = {"name": arguments.name, "type": arguments.type, **assignments(arguments.keys)}
+    return _said(_demand(arguments, {"verb": "obstacle", "set": described}), f"obstacle {arguments.name}: set")
+
+
+def _clear(arguments: argparse.Namespace) -> int:
+    name = EVERYTHING if arguments.all else arguments.name
+    what = "all obstacles" if arguments.all else f"obstacle {name}"
+    return _said(_demand(arguments, {"verb": "obstacle", "clear": name}), f"{what}: cleared")
+
+
+def _goal(arguments: argparse.Namespace) -> int:
+    from rtctl.cli.goals import Outcome, send, send_and_wait
+    from rtctl.hal.client import Session
+
+    message: dict[str, Any] = {"verb": "goal", "position_m": [arguments.x, arguments.y, arguments.z]}
+    for key, value in (("rpy_rad", arguments.rpy), ("wxyz", arguments.wxyz), ("tolerance_m", arguments.tolerance)):
+        if value is not None:
+            message[key] = value
+    if arguments.hold_orientation:
+        message["hold"] = "orientation"
+    with Session(daemon_of(arguments), arguments.reply) as session:
+        if not arguments.wait:
+            return _said(send(session, message), "goal: accepted")
+        outcome: Outcome = send_and_wait(session, message, arguments.timeout)
+    outcome.show(arguments.json)
+    return EXIT_OK if outcome.arrived else EXIT_FAILED
+
+
+def _goals(arguments: argparse.Namespace) -> int:
+    from rtctl.cli.goals import run_stream
+    from rtctl.hal.client import Session
+
+    with Session(daemon_of(arguments), arguments.reply) as session:
+        if arguments.file == "-":
+            return run_stream(session, sys.stdin, "stdin", arguments)
+        with open(arguments.file, encoding="utf-8", errors="replace") as lines:
+            return run_stream(session, lines, arguments.file, arguments)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    from rtctl.hal.client import Session, accepted
+
+    with Session(daemon_of(arguments), arguments.reply) as session:
+
+        def ask() -> dict[str, Any]:
+            return accepted(session.ask({"verb": "status"}))
+
+        if arguments.json:
+            while True:
+                print(json.dumps(ask()), flush=True)
+                if not arguments.watch:
+                    return EXIT_OK
+                time.sleep(WATCH_PERIOD)
+        from rtctl.cli import view
+
+        if not arguments.watch:
+            view.show(ask())
+            return EXIT_OK
+        try:
+            view.watch(ask, WATCH_PERIOD)
+        except KeyboardInterrupt:  # the way one leaves it
+            return EXIT_OK
+        except LinkError as error:
+            raise LinkError(f"the daemon has ended: {error}") from None
+    return EXIT_OK

@@ -1,0 +1,110 @@
+"""Values as people type them: `key=1,2,3`, and the lines of a file of goals."""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from rtctl.errors import UsageError
+
+COLUMNS = {3: ("x", "y", "z"), 6: ("x", "y", "z", "roll", "pitch", "yaw"), 7: ("x", "y", "z", "qw", "qx", "qy", "qz")}
+GROUPS = {"position_m": ("x", "y", "z"), "rpy_rad": ("roll", "pitch", "yaw"), "wxyz": ("qw", "qx", "qy", "qz")}
+SINGLE = ("tolerance_m", "tolerance_rad")
+KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE
+WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz; or a JSON object"
+
+
+def assignments(words: Iterable[str]) -> dict[str, Any]:
+    """Return `key=value` words as a dict: numbers, lists of numbers by commas, JSON, or text. Raises UsageError."""
+    found: dict[str, Any] = {}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not (key and equals and text):
+            raise UsageError(f"got {word!r}, wanted KEY=VALUE")
+        if key in found or key in ("name", "type"):
+            raise UsageError(f"{key}: given twice")
+        found[key] = _value(key, text)
+    return found
+
+
+def goal_messages(lines: Iterable[str], source: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield (line number, request) for each line of CSV or JSON that is not blank or a comment. Raises UsageError."""
+    header: tuple[str, ...] = ()
+    for at, line in enumerate(lines, 1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        place = f"{source}:{at}"
+        if text.startswith("{"):
+            yield at, _from_json(text, place)
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([text]))]
+        if not header and not _is_number(cells[0]):
+            header = _header(cells, place)
+            continue
+        yield at, _from_cells(cells, header or COLUMNS.get(len(cells), ()), place)
+
+
+def _value(key: str, text: str) -> Any:
+    if text[0] in '["{':
+        try:
+            return json.loads(text, parse_constant=_refuse_constant)
+        except ValueError:
+            raise UsageError(f"{key}: got {text!r}, wanted JSON") from None
+    if "," in text:
+        return [_number(part, key) for part in text.split(",")]
+    return _number(text, key) if _is_number(text) else text
+
+
+def _from_json(text: str, place: str) -> dict[str, Any]:
+    try:
+        goal = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{place}: {error}") from None
+    if "position_m" not in goal:
+        raise UsageError(f"{place}: got no position_m, wanted it")
+    return {**goal, "verb": "goal"}
+
+
+def _header(cells: list[str], place: str) -> tuple[str, ...]:
+    names = tuple(cells)
+    odd = [name for name in names if name not in KNOWN]
+    if odd or len(set(names)) != len(names):
+        raise UsageError(f"{place}: got {odd[0] if odd else 'a name twice'}, {WANTED}")
+    return names
+
+
+def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> dict[str, Any]:
+    if len(cells) != len(names):
+        raise UsageError(f"{place}: got {len(cells)} values, {f'wanted {len(names)}' if names else WANTED}")
+    row = {name: _number(cell, f"{place}: {name}") for name, cell in zip(names, cells, strict=True) if cell}
+    message: dict[str, Any] = {"verb": "goal"}
+    for key, group in GROUPS.items():
+        given = [name for name in group if name in row]
+        if given and len(given) != len(group):
+            raise UsageError(f"{place}: got {', '.join(given)} alone, wanted {', '.join(group)}")
+        if given:
+            message[key] = [row[name] for name in group]
+    if "position_m" not in message:
+        raise UsageError(f"{place}: got no position, {WANTED}")
+    return message | {key: row[key] for key in SINGLE if key in row}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(text: str, place: str) -> float:
+    value = float(text) if _is_number(text) else math.nan
+    if not math.isfinite(value):
+        raise UsageError(f"{place}: got {text!r}, wanted a finite number")
+    return value
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is not a number of JSON")

@@ -1,0 +1,256 @@
+"""`rtctl run`: the servo process. One thread, one absolute grid; all that is slow happens elsewhere."""
+
+import os
+import select
+import signal
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from rtctl import config as cfg
+from rtctl.assembly import header_of, link_spec
+from rtctl.config import Config
+from rtctl.control import faults
+from rtctl.control.limits import permit, slew_reference
+from rtctl.control.pipe import warm
+from rtctl.control.robot import Robot
+from rtctl.control.so3 import quat_of
+from rtctl.errors import EXIT_FAILED, EXIT_OK
+from rtctl.hal import clock
+from rtctl.hal.can import CanLink, identifiers
+from rtctl.hal.client import default_path
+from rtctl.hal.clock import Slot
+from rtctl.hal.console import Console
+from rtctl.hal.messages import Bounds
+from rtctl.hal.recorder import Recorder
+from rtctl.hal.service import InstanceLock, Service, bus_resource
+from rtctl.hal.transport import open_transport
+from rtctl.servo import CAN_RX, CAN_TX, Servo, blocker_name
+from rtctl.types import Command, Drive, Link, State, Verb
+
+LOCKSTEP_WAIT = 0.1  # [s] for replies before a lockstep slot goes on without them
+REVIEW = 0.5  # [s] between looks at the recorder
+
+
+class Signals:
+    """SIGTERM and SIGINT: the first asks for rest, the second for torque off."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+
+    def take(self) -> bool:
+        """Return whether a signal waits, and take it."""
+        waits = self.count > 0
+        self.count -= waits
+        return waits
+
+
+def say(text: str, to: int = 1) -> None:
+    """Print a line if that does not block: a terminal that is stopped must not stop the arm."""
+    line = (text + "\n").encode()
+    if select.select([], [to], [], 0.0)[1]:
+        with suppress(OSError):
+            os.write(to, line[-4096:])  # PIPE_BUF: what a writable pipe is sure to take
+
+
+def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> int:
+    """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
+
+    lockstep: each slot waits for the replies instead of for its time (simulated drives that keep step).
+    dry: everything is computed and logged, but only stop frames are sent.
+    """
+    path = Path(config_path)
+    config = cfg.load(path)
+    signals = Signals()
+    with ExitStack() as stack:
+        stack.enter_context(InstanceLock(bus_resource(config.link.interface, config.link.channel), "link.channel"))
+        robot = cfg.build(config, path)
+        warm(robot)
+        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot)
+        console = stack.enter_context(
+            closing(Console(config.console.socket or default_path(robot.name), robot.dt, bounds))
+        )
+        link = stack.enter_context(closing(_opened(config)))
+        say(f"rtctl: {robot.name} on {config.link.interface}:{config.link.channel}, console {console.path}")
+        greeting = link.handshake(listen=0.0 if lockstep else 1e-3 * config.link.listen_ms, recover=True)
+        recorder = _recorder(config, path, robot, greeting.q)
+        servo = Servo(robot, link, recorder, greeting.q, dry)
+        console.publish(lambda: status(servo, recorder))
+        if not lockstep:
+            granted = clock.realtime(
+                config.loop.realtime, -1 if config.loop.cpu is None else config.loop.cpu, config.loop.priority
+            )
+            for refusal in granted.refused:
+                say(f"rtctl: best effort: {refusal}")
+        service = stack.enter_context(closing(Service(robot.dt)))
+        service.ready(f"{robot.name}: IDLE")
+        say(f"rtctl: ready, log {recorder.stats().path}")
+        code = EXIT_FAILED
+        try:
+            slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
+            code = _loop(servo, console, service, recorder, signals, slots, lockstep)
+        finally:
+            _stop_frames(link, robot, recorder)
+            stats = recorder.close("stopped" if code == EXIT_OK else "failed")
+    say(_summary(servo, stats.path, stats.dropped))
+    return code
+
+
+def _opened(config: Config) -> CanLink:
+    spec = link_spec(config)
+    transport = open_transport(
+        config.link.interface,
+        config.link.channel,
+        bitrate=config.link.bitrate,
+        fd=config.link.fd,
+        data_bitrate=config.link.data_bitrate or config.link.bitrate,
+        listen=identifiers(spec.joints),
+        timeout=config.link.handshake_s,
+    )
+    return CanLink(spec, transport)
+
+
+def _recorder(config: Config, path: Path, robot: Robot, q: np.ndarray) -> Recorder:
+    log = config.log
+    return Recorder.start(
+        log.directory,
+        header_of(config, path, robot, q),
+        capacity=1 << (round(log.ring_MB * 1e6) - 1).bit_length(),
+        segment_s=log.segment_s,
+        segment_bytes=round(log.segment_MB * 1e6),
+        floor_bytes=round(log.disk_floor_MB * 1e6),
+    )
+
+
+def _loop(
+    servo: Servo,
+    console: Console,
+    service: Service,
+    recorder: Recorder,
+    signals: Signals,
+    slots: Iterator[Slot],
+    lockstep: bool,
+) -> int:
+    """Turn until the supervisor says that the daemon may leave; return the exit code."""
+    every = max(1, round(REVIEW / servo.robot.dt))
+    told = 0
+    for slot in slots:
+        request = console.poll(slot.slot)
+        if signals.take():
+            request = request._replace(verb=Verb.TERM)
+            service.stopping()
+        try:
+            servo.turn(slot, request)
+        except Exception:
+            _fallback(servo, recorder, slot, slots, lockstep)
+            say(traceback.format_exc().rstrip(), to=2)
+            return EXIT_FAILED
+        console.answer(not servo.memory.verdict, servo.memory.verdict)
+        recorder.beat(time.monotonic_ns())
+        service.kick(slot.slot)
+        for now, name, detail in servo.events[told:]:
+            say(f"{now:10.3f} s  {name}{': ' if detail else ''}{detail}")
+        told = len(servo.events)
+        if slot.slot % every == 0:
+            _review(servo, recorder)
+        if servo.memory.done:
+            return EXIT_OK
+        if lockstep:
+            servo.link.wait_replies(LOCKSTEP_WAIT)
+    raise AssertionError("the grid has no end")
+
+
+def _review(servo: Servo, recorder: Recorder) -> None:
+    """Tell the tick whether the log can be written; bring a dead recorder back while the arm is not driven."""
+    degraded = recorder.stats().degraded
+    servo.flags = int(Link.LOG_DEGRADED) if degraded else 0
+    if degraded and servo.memory.state == State.IDLE:
+        recorder.spawn()
+
+
+def _fallback(servo: Servo, recorder: Recorder, slot: Slot, slots: Iterator[Slot], lockstep: bool) -> None:
+    """A tick raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
+
+    -D qd + g through the permitter, from the feedback alone: nothing of the tick that failed is used.
+    """
+    robot, m = servo.robot, servo.memory
+    driven = bool((servo.link.read(slot.slot, 0, 0.0, 0.0).drive == 1).all())
+    g, sent, rest = m.model.g, m.sent[0], 0
+    for k, turn in enumerate(slots):
+        feedback = servo.link.read(turn.slot, turn.missed, turn.lateness, 0.0)
+        recorder.put_many(CAN_RX, servo.link.received, time.monotonic_ns())
+        rest = rest + 1 if bool((np.abs(feedback.qd) < 0.03).all()) else 0
+        if not driven or rest * robot.dt > 0.1 or k * robot.dt > robot.stop.time:
+            return
+        keep = g - robot.stop.damping * feedback.qd
+        reference = slew_reference(sent, feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, 1)
+        sent = permit(
+            np.zeros(robot.n), keep, feedback.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt
+        ).tau
+        _send(servo.link, recorder, Command(Drive.TORQUE, sent))
+        if lockstep:
+            servo.link.wait_replies(LOCKSTEP_WAIT)
+
+
+def _stop_frames(link: CanLink, robot: Robot, recorder: Recorder) -> None:
+    """Send disable frames until the drives have surely heard one."""
+    for _ in range(robot.stop.frames):
+        _send(link, recorder, Command(Drive.DISABLE, np.zeros(robot.n)))
+        time.sleep(robot.dt)
+        recorder.put_many(CAN_RX, link.transport.receive(), time.monotonic_ns())
+
+
+def _send(link: CanLink, recorder: Recorder, command: Command) -> None:
+    """Send and log what no tick decided."""
+    recorder.put_many(CAN_TX, link.write(command), time.monotonic_ns())
+
+
+def _summary(servo: Servo, log: Path, dropped: int) -> str:
+    m = servo.memory
+    seen = ", ".join(faults.names(servo.faults_seen)) or "none"
+    return (
+        f"rtctl: {m.state.name} after {m.tick + 1} ticks, {servo.missed} slots missed, faults: {seen}, "
+        f"log {log} ({dropped} entries dropped)"
+    )
+
+
+def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
+    """Return what `rtctl status` shows."""
+    m, robot = servo.memory, servo.robot
+    goal = m.goal
+    stats = recorder.stats()
+    return {
+        "robot": robot.name,
+        "state": m.state.name,
+        "status": m.status.name.lower(),
+        "detail": blocker_name(robot, m),
+        "tick": m.tick,
+        "time_s": m.tick * robot.dt,
+        "q_rad": m.joints.q,
+        "x_m": m.tip.x,
+        "wxyz": quat_of(m.tip.R),
+        "speed_m_s": float(np.linalg.norm(m.tip.xd)),
+        "goal_m": None if goal is None else goal.position,
+        "error_m": None if goal is None else float(np.linalg.norm(goal.position - m.tip.x)),
+        "error_rad": servo.error_rot(),
+        "clearance_m": {
+            name: float(d) for name, d in zip(m.world.names, m.rho, strict=True) if name and np.isfinite(d)
+        },
+        "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
+        "missed": servo.missed,
+        "lateness_s": servo.lateness,
+        "compute_s": servo.compute,
+        "faults": list(faults.names(m.in_force)),
+        "log": {"path": str(stats.path), "dropped": stats.dropped, "degraded": stats.degraded},
+    }

@@ -1,0 +1,145 @@
+"""One turn of the servo loop, the same for the daemon, the simulation and replay's source: link, tick, link, log."""
+
+import hashlib
+import time
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rtctl.control import faults
+from rtctl.control.memory import Memory
+from rtctl.control.pipe import initial, tick
+from rtctl.control.robot import Robot
+from rtctl.control.so3 import error_to
+from rtctl.hal.can import CanLink
+from rtctl.hal.clock import Slot
+from rtctl.log.request import encode_event, encode_request
+from rtctl.types import Command, Drive, Feedback, Record, Request, Status, Task
+
+TICK, CAN_TX, CAN_RX, EVENT, REQUEST = 1, 2, 3, 4, 5  # kinds of the log's messages
+QUIET = Request()
+
+
+class Sink(Protocol):
+    """Where messages go: the recorder's ring, or a file."""
+
+    def put_many(self, kind: int, payloads: list[bytes], time_ns: int) -> bool: ...
+
+
+class Turn(NamedTuple):
+    """What one turn did."""
+
+    feedback: Feedback
+    command: Command
+    record: Record
+    frames: list[bytes]  # sent
+
+
+def first_feedback(q: np.ndarray) -> Feedback:
+    """Return the feedback of a handshake: positions (n,) [rad], everything else at rest."""
+    n = len(q)
+    zero = np.zeros(n)
+    return Feedback(
+        -1, 0, q.astype(np.float64), zero, zero, zero, np.ones(n, np.int64), np.zeros(n, np.int64), 0, 0.0, 0.0
+    )
+
+
+class Servo:
+    """The memory between turns, the digest of what was sent, and the events that people read."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        link: CanLink,
+        sink: Sink | None,
+        q: np.ndarray,
+        dry: bool = False,
+        stamp: Callable[[float], int] | None = None,
+    ) -> None:
+        """`q` (n,) [rad] as the handshake found it; `dry` computes and logs but sends only stop frames.
+
+        `stamp` turns robot time [s] into the log's [ns]; by default it is the monotonic clock.
+        """
+        self.robot, self.link, self.sink, self.dry = robot, link, sink, dry
+        self.stamp = stamp if stamp is not None else lambda now: time.monotonic_ns()
+        self.memory: Memory = initial(robot, first_feedback(q))
+        self.digest = hashlib.sha256()
+        self.missed = 0
+        self.faults_seen = 0
+        self.compute = 0.0  # [s] of the previous turn
+        self.events: list[tuple[float, str, str]] = []  # newest last; (time [s], name, detail)
+        self.lateness = 0.0  # [s] of this wake-up
+        self.flags = 0  # types.Link bits that only the daemon knows
+
+    def turn(self, slot: Slot, request: Request) -> Turn:
+        """Read, decide, write, record."""
+        begin = time.perf_counter()
+        feedback = self.link.read(slot.slot, slot.missed, slot.lateness, self.compute)
+        if self.flags:
+            feedback = feedback._replace(link=feedback.link | self.flags)
+        before = self.memory
+        self.memory, command, record = tick(self.robot, before, feedback, request)
+        sent = command._replace(drive=Drive.DISABLE) if self.dry else command
+        frames = self.link.write(sent)
+        self.digest.update(b"".join(frames))
+        self.missed += slot.missed
+        self.lateness = slot.lateness
+        self.faults_seen |= self.memory.in_force
+        now = slot.slot * self.robot.dt
+        news = _news(self.robot, before, self.memory, feedback)
+        self.events += [(now, name, detail) for name, detail in news]
+        self._log(feedback, record, frames, request, now, news)
+        self.compute = time.perf_counter() - begin
+        return Turn(feedback, command, record, frames)
+
+    def error_rot(self) -> float | None:
+        """Return the angle [rad] to the goal's orientation, None when it asks for none."""
+        m = self.memory
+        if m.goal is None or m.goal.task == Task.POSITION:
+            return None
+        return float(np.linalg.norm(error_to(m.tip.R, m.goal.wxyz)))
+
+    def _log(
+        self,
+        feedback: Feedback,
+        record: Record,
+        frames: list[bytes],
+        request: Request,
+        now: float,
+        news: list[tuple[str, str]],
+    ) -> None:
+        if self.sink is None:
+            return
+        stamp = self.stamp(now)
+        if request is not QUIET and request != QUIET:
+            self.sink.put_many(REQUEST, [encode_request(self.memory.tick, request)], stamp)
+        self.sink.put_many(CAN_RX, self.link.received, stamp)
+        self.sink.put_many(TICK, [record.tobytes()], stamp)
+        self.sink.put_many(CAN_TX, frames, stamp)
+        if news:
+            self.sink.put_many(EVENT, [encode_event(self.memory.tick, now, *each) for each in news], stamp)
+
+
+def _news(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> list[tuple[str, str]]:
+    """Return what changed in this tick, as (name, detail): states, faults, statuses, refusals."""
+    news = []
+    if after.verdict:
+        news.append(("rejected", after.verdict))
+    fresh = after.in_force & ~before.in_force
+    if fresh:
+        news.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
+    if after.state != before.state:
+        news.append(("state", after.state.name))
+    if (after.status, after.blocker) != (before.status, before.blocker) and after.status != Status.NO_GOAL:
+        news.append((after.status.name.lower(), blocker_name(robot, after)))
+    return news
+
+
+def blocker_name(robot: Robot, m: Memory) -> str:
+    """Return the name of the obstacle or joint that holds the arm, '' for none."""
+    if m.blocker < 0:
+        return ""
+    if m.status in (Status.LIMITED, Status.SATURATED):
+        return robot.joints[m.blocker]
+    return m.world.names[m.blocker]

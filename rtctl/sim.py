@@ -1,0 +1,257 @@
+"""`rtctl sim`: controller and virtual robot in one process, in lockstep, deterministic.
+
+The controller is the daemon's own servo on the same CAN bytes; only the bus is a function call. What is reported comes
+from the simulator's account of the truth, which the controller never sees.
+"""
+
+import time
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtctl import config as cfg
+from rtctl.assembly import header_of, link_spec
+from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
+from rtctl.control import faults
+from rtctl.control.robot import Robot
+from rtctl.control.so3 import R_of, error, quat_of
+from rtctl.errors import ConfigError, RtctlError
+from rtctl.hal.can import CanLink
+from rtctl.hal.clock import lockstep
+from rtctl.hal.transport import InProcess
+from rtctl.servo import Servo, Turn
+from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Task, Truth, Verb
+
+CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
+ARM_TIME = 2.0  # [s] within which the robot must be running
+SHOWN = frozenset(("state", "fault"))  # events that are no statuses
+
+
+class _Leg(NamedTuple):
+    """One goal on its way: where the tip was when it was given."""
+
+    goal: Goal
+    at: float  # [s]
+    start: F64  # (3,) [m]
+    reached: float = -1.0  # [s] since when the tip has stayed within the tolerances, -1 = not now
+    deviation: float = 0.0  # [m] from the straight line
+    error: float = np.inf  # [m]
+    error_rot: float = np.inf  # [rad]
+
+
+class Tally:
+    """Figures of a run, from the truth of each period."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.legs: list[_Leg] = []
+        self.tip: F64 | None = None
+        self.tau: F64 | None = None
+        self.path = self.speed = 0.0
+        self.torque = self.rate = self.joint_speed = 0.0
+        self.margin = self.own = np.inf
+        self.clearance: dict[str, float] = {}
+        self.contacts = 0
+        self.offset = 0.0  # [s] scenario time less the servo's
+
+    def add(self, truth: Truth, turn: Turn) -> None:
+        """Take one period into account."""
+        robot = self.robot
+        self.offset = truth.time - (turn.feedback.slot + 1) * robot.dt
+        if self.tip is not None:
+            step = float(np.linalg.norm(truth.tip - self.tip))
+            self.path, self.speed = self.path + step, max(self.speed, step / robot.dt)
+        self.tip = truth.tip.copy()
+        driven = turn.command.drive == Drive.TORQUE
+        if driven and self.tau is not None:
+            self.rate = max(self.rate, float((np.abs(turn.command.tau - self.tau) / (robot.tau_rate * robot.dt)).max()))
+        self.tau = turn.command.tau if driven else None
+        self.torque = max(self.torque, float((np.abs(turn.command.tau) / robot.tau_rated).max()))
+        self.joint_speed = max(self.joint_speed, float((np.abs(truth.qd) / robot.qd_max).max()))
+        self.margin = min(self.margin, float(np.minimum(truth.q - robot.q_min, robot.q_max - truth.q).min()))
+        self.own, self.contacts = min(self.own, truth.self_clearance), truth.contacts
+        for name, d in truth.clearance.items():
+            self.clearance[name] = min(d, self.clearance.get(name, np.inf))
+        if self.legs:
+            self.legs[-1] = _advanced(self.legs[-1], truth)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures under their published names."""
+        last = self.legs[-1] if self.legs else None
+        goals = [
+            {
+                "at_s": _r(leg.at),
+                "arrived": leg.reached >= 0.0,
+                "time_to_goal_s": _r(leg.reached - leg.at) if leg.reached >= 0.0 else None,
+                "error_m": _r(leg.error),
+                "error_rad": _r(leg.error_rot),
+                "line_deviation_m": _r(leg.deviation),
+            }
+            for leg in self.legs
+        ]
+        return {
+            "arrived": bool(self.legs) and all(leg.reached >= 0.0 for leg in self.legs),
+            "time_to_goal_s": goals[-1]["time_to_goal_s"] if goals else None,
+            "final_error_m": _r(last.error) if last else None,
+            "final_error_rad": _r(last.error_rot) if last else None,
+            "path_length_m": _r(self.path),
+            "line_deviation_m": _r(max((leg.deviation for leg in self.legs), default=0.0)),
+            "max_speed_m_s": _r(self.speed),
+            "min_clearance_m": {
+                "all": _r(min(self.clearance.values())) if self.clearance else None,
+                **{name: _r(d) for name, d in self.clearance.items()},
+            },
+            "min_self_clearance_m": _r(self.own),
+            "contacts": self.contacts,
+            "min_joint_margin_rad": _r(self.margin),
+            "max_torque_ratio": _r(self.torque),
+            "max_torque_rate_ratio": _r(self.rate),
+            "max_joint_speed_ratio": _r(self.joint_speed),
+            "goals": goals,
+        }
+
+
+def _r(value: float) -> float | None:
+    """Return a figure to nine digits; JSON has no infinity."""
+    return float(f"{value:.9g}") if np.isfinite(value) else None
+
+
+def _advanced(leg: _Leg, truth: Truth) -> _Leg:
+    """Return the leg after a period: distance to the goal, to the line, and since when it has been there."""
+    goal = leg.goal
+    e = float(np.linalg.norm(goal.position - truth.tip))
+    e_rot = 0.0
+    if goal.task == Task.POSE:
+        e_rot = float(np.linalg.norm(error(R_of(truth.tip_wxyz), R_of(goal.wxyz))))
+    along = goal.position - leg.start
+    length = float(np.linalg.norm(along))
+    offset = truth.tip - leg.start
+    if length > 1e-9:
+        offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
+    there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
+    reached = (leg.reached if leg.reached >= 0.0 else truth.time) if there else -1.0
+    return leg._replace(
+        reached=reached, deviation=max(leg.deviation, float(np.linalg.norm(offset))), error=e, error_rot=e_rot
+    )
+
+
+class Feed:
+    """What the controller is told and when: arming, the scenario's goals, and a camera's view of its obstacles."""
+
+    def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: Tally) -> None:
+        self.robot, self.simulator, self.tally = robot, simulator, tally
+        self.pending = list(scenario.goal)
+        self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its verdict not yet seen
+        self.last: dict[str, Any] = {}
+        self.frames = 0
+
+    def request(self, servo: Servo, truth: Truth) -> Request:
+        """Return the request of this period."""
+        m = servo.memory
+        if self.waiting is not None and not m.verdict:
+            self.tally.legs.append(_Leg(*self.waiting))
+        self.waiting = None
+        verb = Verb.NONE
+        if m.state == State.IDLE and m.tick < 0:
+            verb = Verb.RECOVER if _outside(self.robot, truth) else Verb.ARM
+        goal = None
+        due = self.pending and truth.time >= self.pending[0].at_s
+        if due and m.state == State.RUN and not m.outside:
+            goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
+            self.waiting = (goal, truth.time, truth.tip.copy())
+        return Request(verb, goal, self._seen(truth))
+
+    def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:
+        """Return what a camera reports: everything at first, then at its rate what moves, appears or is gone."""
+        if truth.time * CAMERA_HZ < self.frames and self.frames:
+            return ()
+        self.frames = int(truth.time * CAMERA_HZ) + 1
+        seen = []
+        for edit in self.simulator.obstacles():
+            old = self.last.get(edit.name)
+            if edit.shape is not None and old is not None and _same_and_still(edit.shape, old):
+                continue
+            self.last[edit.name] = edit.shape
+            seen.append(edit)
+        return tuple(seen)
+
+
+def _same_and_still(a: Shape, b: Shape) -> bool:
+    """Return whether an obstacle rests where it was seen to rest before."""
+    moving = a.velocity.any() or a.omega.any() or b.velocity.any()
+    return not moving and bool((a.position == b.position).all())
+
+
+def _outside(robot: Robot, truth: Truth) -> bool:
+    return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
+
+
+def open_simulator(config_path: Path, scenario: Scenario) -> Simulator:
+    """Return the installed simulator. Raises ConfigError when none is, RtctlError with what it refuses."""
+    found = {e.name: e for e in entry_points(group="rtctl.simulator")}
+    if "pybullet" not in found:
+        raise ConfigError("entry point rtctl.simulator", sorted(found) or "none", "one named pybullet: pip install .")
+    try:
+        simulator: Simulator = found["pybullet"].load()(str(config_path), scenario_dict(scenario), seed=scenario.seed)
+    except RtctlError:
+        raise
+    except Exception as error:  # another program's refusal: its words, not its traceback
+        raise RtctlError(f"simulator: {error}") from error
+    return simulator
+
+
+def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = False) -> dict[str, Any]:
+    """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
+    scenario = load_scenario(path)
+    where = robot_file(scenario, path)
+    config = cfg.load(where)
+    robot = cfg.build(config, where)
+    start = scenario.start_q_rad
+    if start is not None and len(start) != robot.n:
+        raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
+    simulator = open_simulator(where, scenario)
+    link = CanLink(link_spec(config), InProcess.of(simulator))
+    sink = None
+    try:
+        greeting = link.handshake(listen=0.0, recover=True)
+        if log is not None:
+            from rtctl.log.writer import McapSink
+
+            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q))
+        servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
+        tally = Tally(robot)
+        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime)
+        elapsed = time.perf_counter() - begun
+    finally:
+        if sink is not None:
+            sink.close("end")
+        link.close()
+    return {
+        **tally.figures(),
+        "statuses": [[_r(t + tally.offset), name, detail] for t, name, detail in servo.events if name not in SHOWN],
+        "mode_final": servo.memory.state.name,
+        "faults": list(faults.names(servo.faults_seen)),
+        "ticks": ticks,
+        "missed": servo.missed,
+        "realtime_factor": _r(ticks * robot.dt / elapsed),
+        "digest": servo.digest.hexdigest(),
+    }
+
+
+def _play(servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool) -> int:
+    """Run the servo in lockstep until the scenario is over; return the ticks it took."""
+    feed = Feed(servo.robot, scenario, simulator, tally)
+    dt, begun = servo.robot.dt, time.monotonic()
+    ticks = 0
+    for slot in lockstep():
+        truth = simulator.truth()
+        if truth.time >= scenario.duration_s or slot.slot * dt > scenario.duration_s + ARM_TIME:
+            break
+        turn = servo.turn(slot, feed.request(servo, truth))
+        tally.add(simulator.truth(), turn)
+        ticks += 1
+        if realtime:
+            time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))
+    return ticks
