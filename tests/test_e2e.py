@@ -1,0 +1,137 @@
+"""End-to-end protection: what a receiver must notice, and what it makes of it."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtctl.protocol import e2e
+from rtctl.protocol.e2e import Check, Receiver, sequence
+
+payloads = st.binary(min_size=8, max_size=8)
+identifiers = st.integers(0, 0x7FF)
+bytes8 = st.integers(0, 255)
+
+
+def remainder(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE as polynomial long division of the message, start value 0xFFFF."""
+    value = int.from_bytes(data, "big") << 16 ^ 0xFFFF << 8 * len(data)
+    for bit in range(8 * len(data) + 15, 15, -1):
+        if value >> bit & 1:
+            value ^= 0x11021 << bit - 16
+    return value
+
+
+def test_the_catalogued_check_value() -> None:
+    # The CRC covers the identifier as two bytes more, so "89" stands there as 0x3839.
+    assert e2e.crc(b"1234567", 0x3839) == remainder(b"123456789") == 0x29B1
+
+
+def test_a_protected_frame_by_hand() -> None:
+    covered = bytes.fromhex("80008000000008000701")
+    data = e2e.protect(covered[:8], 7, 1, 0x123)
+    assert data == covered + remainder(covered + b"\x01\x23").to_bytes(2, "big")
+
+
+@given(payloads, bytes8, bytes8, identifiers)
+def test_a_frame_is_intact_as_sent(payload: bytes, counter: int, status: int, can_id: int) -> None:
+    data = e2e.protect(payload, counter, status, can_id)
+    assert (len(data), data[:8], data[8], data[9]) == (12, payload, counter, status)
+    assert e2e.intact(data, can_id)
+
+
+@given(payloads, bytes8, identifiers, st.integers(0, 95), st.integers(1, 0xFFFF))
+def test_every_burst_of_up_to_sixteen_bits_is_noticed(
+    payload: bytes, counter: int, can_id: int, at: int, burst: int
+) -> None:
+    data = e2e.protect(payload, counter, 0, can_id)
+    spoilt = (int.from_bytes(data, "big") ^ burst << at) & (1 << 96) - 1
+    changed = spoilt.to_bytes(12, "big")
+    assert changed == data or not e2e.intact(changed, can_id)
+
+
+def test_every_pair_of_wrong_bits_is_noticed() -> None:
+    data = int.from_bytes(e2e.protect(bytes(range(8)), 9, 1, 3), "big")
+    pairs = [1 << i | 1 << j for i in range(96) for j in range(i)]
+    assert not any(e2e.intact((data ^ pair).to_bytes(12, "big"), 3) for pair in pairs)
+
+
+@given(payloads, identifiers, identifiers)
+def test_a_frame_under_another_identifier_is_noticed(payload: bytes, sent: int, received: int) -> None:
+    assert e2e.intact(e2e.protect(payload, 0, 0, sent), received) == (sent == received)
+
+
+@given(st.binary(max_size=64).filter(lambda data: len(data) != 12))
+def test_a_frame_of_another_length_is_not_intact(data: bytes) -> None:
+    assert not e2e.intact(data, 1)
+
+
+@pytest.mark.parametrize("length", [0, 7, 9])
+def test_only_eight_bytes_can_be_protected(length: int) -> None:
+    with pytest.raises(ValueError, match="payload"):
+        e2e.protect(bytes(length), 0, 0, 1)
+
+
+@given(bytes8)
+def test_the_next_counter_is_in_sequence_also_round_the_end(last: int) -> None:
+    assert sequence(last, (last + 1) % 256) == (Check.OK, 0)
+    assert sequence(last, last) == (Check.REPEATED, 0)
+    assert not sequence(last, last).fresh
+
+
+def test_the_first_frame_is_taken_whatever_it_counts() -> None:
+    assert all(sequence(-1, counter) == (Check.OK, 0) for counter in range(256))
+
+
+@given(bytes8, st.integers(1, 126))
+def test_lost_frames_are_counted_and_the_newer_one_is_used(last: int, lost: int) -> None:
+    received = sequence(last, (last + 1 + lost) % 256)
+    assert received == (Check.WRONGSEQUENCE, lost)
+    assert received.fresh
+
+
+@given(bytes8, st.integers(1, 128))
+def test_an_older_frame_is_not_used(last: int, older: int) -> None:
+    received = sequence(last, (last - older) % 256)
+    assert received == (Check.WRONGSEQUENCE, -older)
+    assert not received.fresh
+
+
+def test_two_frames_that_overtook_each_other() -> None:
+    receiver = Receiver()
+    verdicts = [receiver.judge(counter) for counter in (1, 3, 2, 4)]
+    assert [v.fresh for v in verdicts] == [True, True, False, True]
+    assert [v.lost for v in verdicts] == [0, 1, -1, 0]
+
+
+def test_disorder_saturates_and_recedes() -> None:
+    receiver = Receiver()
+    receiver.judge(0)
+    for step in range(1, 9):
+        receiver.judge(2 * step)  # every other frame lost
+        assert receiver.disorder == min(step, e2e.DISORDER_LIMIT)
+    for step in range(1, 9):
+        receiver.judge(16 + step)
+        assert receiver.disorder == max(e2e.DISORDER_LIMIT - step, 0)
+
+
+def test_a_drive_that_counts_anew_is_followed_again_once_it_was_reported() -> None:
+    receiver = Receiver()
+    receiver.restart(100)
+    verdicts = []
+    for counter in range(1, 9):
+        verdicts.append(receiver.judge(counter).fresh)
+        if verdicts[-1]:
+            break
+    assert verdicts == [False] * (e2e.DISORDER_LIMIT + 1) + [True]
+    assert receiver.disorder == e2e.DISORDER_LIMIT - 1
+
+
+@given(st.lists(bytes8, max_size=60))
+def test_a_frame_is_never_used_twice_in_a_row_whatever_comes(counters: list[int]) -> None:
+    receiver, followed = Receiver(), -1
+    for counter in counters:
+        if receiver.judge(counter).fresh:
+            assert counter != followed
+        if receiver.last == counter:  # used, or taken up as the start of a drive that counts anew
+            followed = counter
+        assert 0 <= receiver.disorder <= e2e.DISORDER_LIMIT

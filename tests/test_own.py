@@ -1,0 +1,141 @@
+"""The arm against itself: distances against the meshes themselves, slopes by differences, forces by hand."""
+
+from functools import cache
+
+import coal
+import numpy as np
+import pinocchio
+import pytest
+
+from rtctl.control.field import CAPPED, CONTACT, field_params, own_field
+from rtctl.control.model import RigidBody
+from rtctl.control.own import Own, hulls_of, nothing, watched
+from rtctl.types import F64
+from tests.arms import NO_POINTS, PANDA_HOME, panda
+
+INFLUENCE, REACH = 0.02, 0.04
+PARAMS = field_params(0.5, INFLUENCE, 0.008, 1e-3, 1.0, 0.0, 50.0)
+UNDAMPED = PARAMS._replace(k_d=0.0)
+
+
+@cache
+def own() -> Own:
+    limits = panda().limits
+    return watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, INFLUENCE, REACH)
+
+
+def postures(count: int, seed: int = 2) -> F64:
+    limits = panda().limits
+    return np.random.default_rng(seed).uniform(limits.q_min, limits.q_max, (count, 7))
+
+
+def meshes_of(body: RigidBody, q: F64) -> dict[str, tuple[coal.CollisionGeometry, coal.Transform3s]]:
+    """Return each link's own collision mesh (not our hull of it), placed by Pinocchio."""
+    data, placement = body.model.createData(), body.geometry.createData()
+    pinocchio.updateGeometryPlacements(body.model, data, body.geometry, placement, q)
+    return {
+        thing.name.rpartition("_")[0]: (
+            thing.geometry,
+            coal.Transform3s(placement.oMg[k].rotation, placement.oMg[k].translation),
+        )
+        for k, thing in enumerate(body.geometry.geometryObjects)
+        if thing.name.endswith("_0") and "finger" not in thing.name
+    }
+
+
+def test_distances_are_those_of_the_meshes() -> None:
+    checked = 0
+    for q in postures(150):
+        m = panda().evaluate(q, np.zeros(7), NO_POINTS, own())
+        meshes = meshes_of(panda(), q)
+        for (far, near), rho in zip(own().names, m.own_rho, strict=True):
+            if far in meshes and near in meshes and rho > 1e-4:
+                true = coal.distance(*meshes[far], *meshes[near], coal.DistanceRequest(), coal.DistanceResult())
+                assert true == pytest.approx(rho, abs=2e-4) if np.isfinite(rho) else true >= REACH - 2e-4
+                checked += 1
+    assert checked > 500
+
+
+def test_slopes_are_those_of_finite_differences() -> None:
+    h, checked, bad = 1e-6, 0, 0
+    for q in postures(500, seed=1):
+        m = panda().evaluate(q, np.zeros(7), NO_POINTS, own())
+        for s in np.flatnonzero(np.isfinite(m.own_rho) & (m.own_rho > 2e-3)):
+            ends = [[panda().own_distances(q + sign * h * e, own())[s] for sign in (-1.0, 1.0)] for e in np.eye(7)]
+            slope = np.array([(b - a) / (2 * h) for a, b in ends])
+            if np.isfinite(slope).all():  # none of the postures left the measured zone
+                wrong = np.abs(slope - m.own_row[s]).max() > 1e-3
+                checked += 1
+                bad += wrong  # where two faces are parallel the nearest points jump and there is no slope
+    assert checked > 30
+    assert bad <= 0.05 * checked
+
+
+def test_neighbours_and_links_that_never_meet_are_not_watched() -> None:
+    names = set(own().names)
+    # the hulls of forearm and hand fill the crook of the wrist: near at home, two joints apart
+    assert not {("panda_hand", "panda_link5"), ("panda_link7", "panda_link5")} & names
+    assert not {("panda_link2", "panda_link1"), ("panda_link5", "panda_link3"), ("panda_link4", "panda_link2")} & names
+    assert {("panda_hand", "panda_link0"), ("panda_hand", "panda_link2"), ("panda_link5", "panda_link0")} <= names
+
+
+def test_the_bounding_balls_hold_their_hulls() -> None:
+    from rtctl.control.solids import solids_of
+
+    hulls = {h.name: h for h in hulls_of(panda())}
+    for solid in solids_of(panda()):
+        h = hulls[solid.name]
+        assert np.linalg.norm(solid.corners - h.centre, axis=1).max() <= h.radius + 1e-12
+
+
+def test_without_pairs_nothing_is_measured_and_nothing_pushes() -> None:
+    m = panda().evaluate(PANDA_HOME, np.zeros(7), NO_POINTS, nothing())
+    assert m.own_rho.shape == (0,)
+    tau, least, flags = own_field(m.own_rho, m.own_row, np.zeros(7), np.zeros(7), m.A_inv, PARAMS)
+    assert not tau.any()
+    assert (least, flags) == (np.inf, 0)
+
+
+ROW = np.array([[0.3, -0.2, 0.5]])
+M = np.random.default_rng(4).normal(size=(3, 3))
+A_INV = np.asarray(np.linalg.inv(M @ M.T + np.eye(3)), np.float64)
+
+
+def push(rho: float) -> float:
+    """Return the slope of U = eta/2 (1/rho - 1/rho0)^2 by differences."""
+    h = 1e-8
+
+    def U(r: float) -> float:
+        return 0.5 * PARAMS.eta * (1 / r - 1 / PARAMS.rho0) ** 2
+
+    return (U(rho - h) - U(rho + h)) / (2 * h)
+
+
+def test_a_pair_is_opened_with_the_acceleration_of_a_unit_mass() -> None:
+    tau, least, flags = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED)
+    assert ROW[0] @ A_INV @ tau == pytest.approx(push(0.012), rel=1e-5)
+    assert np.linalg.norm(np.cross(tau, ROW[0])) < 1e-9 * np.linalg.norm(tau)
+    assert (least, flags) == (0.012, 0)
+
+
+def test_distance_follows_the_joints_between_two_evaluations() -> None:
+    dq = np.array([0.01, 0.0, -0.002])
+    rho = 0.012 + float(ROW[0] @ dq)
+    tau, least, _ = own_field(np.array([0.012]), ROW, dq, np.zeros(3), A_INV, UNDAMPED)
+    assert least == pytest.approx(rho)
+    assert ROW[0] @ A_INV @ tau == pytest.approx(push(rho), rel=1e-5)
+
+
+def test_only_closing_is_damped() -> None:
+    still = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, PARAMS)[0]
+    closing = own_field(np.array([0.012]), ROW, np.zeros(3), -ROW[0], A_INV, PARAMS)[0]
+    opening = own_field(np.array([0.012]), ROW, np.zeros(3), ROW[0], A_INV, PARAMS)[0]
+    assert closing @ ROW[0] > still @ ROW[0] > 0.0
+    assert np.allclose(opening, still)
+
+
+@pytest.mark.parametrize("rho", [0.0, -0.03, PARAMS.rho_num])
+def test_contact_is_flagged_bounded_and_still_pushed_apart(rho: float) -> None:
+    tau, _, flags = own_field(np.array([rho]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED)
+    assert flags == (CAPPED if rho > 0.0 else CAPPED | CONTACT)
+    assert ROW[0] @ A_INV @ tau == pytest.approx(push(PARAMS.rho_num), rel=1e-5)
