@@ -49,7 +49,6 @@ class Session(RuleBasedStateMachine):
     def power_on(self, q: tuple[float, ...] | None) -> None:
         self.lab = Lab(PANDA, open_simulator(PANDA, None, q, seed=1))
         self.sent = Command(Drive.DISABLE, np.zeros(7))
-        self.request = Request()
 
     def teardown(self) -> None:
         if self.lab is not None:
@@ -77,7 +76,7 @@ class Session(RuleBasedStateMachine):
         assert memory.state in (State.IDLE, State.ARMED, State.RUN, State.STOPPING, *LATCHED_STATES)
         assert (memory.goal is not None) <= (memory.state == State.RUN)
         for drive in here.simulator.drives:  # one that hears nothing for W drives nothing
-            if 0 < drive.timeout_ns <= drive.silence_ns:
+            if 0 < drive.timeout_ns < drive.silence_ns:  # judged when the next physics step begins
                 assert drive.state is not DriveState.ENABLED
         self.sent = command
 
@@ -131,10 +130,16 @@ class Session(RuleBasedStateMachine):
         self._step(Request(verb))
 
     @precondition(lambda self: self.lab is not None and self.lab.memory.state == State.IDLE)
-    @rule()
-    def it_is_brought_to_run(self) -> None:
+    @rule(goal=near)
+    def it_is_brought_to_run(self, goal: tuple[float, float, float]) -> None:
+        """What an operator does who means it."""
+        for verb in (Verb.RESET, Verb.RESET, Verb.RESET):
+            self._step(Request(verb, obstacles=(ObstacleEdit("*", None),)))
+            self._play(60)
         self._step(Request(Verb.RECOVER))
-        self._play(260)
+        self._play(400)
+        self._step(Request(goal=Goal(np.array(goal), np.array([0.0, 1.0, 0.0, 0.0]), Task.POSITION, 0.003, 0.015)))
+        self._play(30)
 
     @precondition(lambda self: self.lab is not None and self.lab.memory.state in LATCHED_STATES)
     @rule()
@@ -195,7 +200,11 @@ class Session(RuleBasedStateMachine):
         self._play(ticks)
         self.lab.servo.flags = 0
 
-    @rule(can_id=st.integers(0, 0x7FF), data=st.binary(max_size=12), fd=st.booleans())
+    @rule(
+        can_id=st.one_of(st.integers(0x11, 0x20), st.integers(0x20, 0x7FE), st.sampled_from([1, 0x7FF])),
+        data=st.binary(max_size=12),
+        fd=st.booleans(),
+    )
     def somebody_else_sends(self, can_id: int, data: bytes, fd: bool) -> None:
         assert self.lab is not None
         whole = (data + bytes(12))[:12] if fd else data[:8]
@@ -214,7 +223,7 @@ class Session(RuleBasedStateMachine):
 
 TestSession = Session.TestCase
 TestSession.settings = settings(
-    max_examples=30,
+    max_examples=40,
     stateful_step_count=25,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],

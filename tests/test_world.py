@@ -61,6 +61,8 @@ def test_clearing_frees_the_slot_and_a_star_frees_all():
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1), np.nan), "obstacle a: age"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1), -1.0), "obstacle a: age"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1), np.inf), "obstacle a: age"),
+        (ObstacleEdit("*", sphere("*", [0.0, 0.0, 0.0], 0.1)), "wanted a name"),
+        (ObstacleEdit("", sphere("", [0.0, 0.0, 0.0], 0.1)), "wanted a name"),
     ],
 )
 def test_an_edit_that_cannot_be_done_is_refused_by_name_and_changes_nothing(edit: ObstacleEdit, reason: str):
@@ -115,6 +117,16 @@ def test_the_configs_own_obstacles_never_grow_stale():
     table = with_static(empty(4), (sphere("wall", [1.0, 0.0, 0.0], 0.1, (0.1, 0.0, 0.0)),))
     assert oldest(advanced(table, 100.0)) == 0.0
     assert "wall" in table.names
+
+
+def test_the_configs_own_obstacles_are_always_there():
+    table = put(with_static(empty(4), (sphere("wall", [1.0, 0.0, 0.0], 0.1),)), sphere("ball", [2.0, 0.0, 0.0], 0.1))
+    cleared, refusal = edited(table, (ObstacleEdit("*", None),))
+    assert (named(cleared), refusal) == ({"wall"}, "")
+    for shape in (None, sphere("wall", [9.0, 0.0, 0.0], 0.1)):
+        same, refusal = edited(table, (ObstacleEdit("wall", shape),))
+        assert "wall: is the config's own" in refusal
+        assert distance_from(same, ORIGIN).min() == pytest.approx(0.9)
 
 
 def test_every_slot_can_be_used_and_the_last_is_seen():

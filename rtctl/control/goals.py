@@ -1,5 +1,6 @@
 """Goals: which are taken, and what the controller says of its progress (its level of competence)."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -34,9 +35,9 @@ def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str
     """
     if not (np.isfinite(goal.position).all() and np.isfinite(goal.wxyz).all()):
         return "goal: got a number that is not finite, wanted finite ones"
-    if abs(float(np.sqrt((goal.wxyz**2).sum())) - 1.0) > 1e-3:
+    if abs(math.hypot(*goal.wxyz) - 1.0) > 1e-3:
         return f"goal: got wxyz {goal.wxyz}, wanted a unit quaternion"
-    d = float(np.sqrt(((goal.position - base) ** 2).sum()))
+    d = math.dist(goal.position, base)
     if d > reach:
         return f"goal: got {d:.3f} m from the base, wanted at most the arm's reach of {reach:.3f} m"
     k = int(goal_rho.argmin())

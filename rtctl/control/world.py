@@ -21,18 +21,20 @@ class World(NamedTuple):
     names: tuple[str, ...]  # (K,)
     age: F64  # (K,) [s] since the obstacle was last observed
     moving: B1  # (K,) its observation grows stale
+    fixed: B1  # (K,) of the config: nobody clears or replaces it
 
 
 def empty(slots: int = SLOTS) -> World:
     """Return a table without obstacles."""
-    return World(obstacles_empty(slots), ("",) * slots, np.zeros(slots), np.zeros(slots, np.bool_))
+    no = np.zeros(slots, np.bool_)
+    return World(obstacles_empty(slots), ("",) * slots, np.zeros(slots), no, no)
 
 
 def with_static(world: World, shapes: tuple[Shape, ...]) -> World:
     """Return the table with the config's own obstacles, which never grow stale."""
     world, refusal = edited(world, tuple(ObstacleEdit(s.name, s) for s in shapes))
     assert not refusal, refusal  # config bounds their number
-    return world._replace(moving=np.zeros_like(world.moving))
+    return world._replace(moving=np.zeros_like(world.moving), fixed=np.array([bool(name) for name in world.names]))
 
 
 def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
@@ -40,8 +42,14 @@ def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
     refusal = ""
     for edit in edits:
         slots = [i for i, name in enumerate(world.names) if name and edit.name in (name, "*")]
+        if edit.name in ("", "*") and edit.shape is not None:
+            refusal = f"obstacle: got {edit.name!r}, wanted a name"
+            continue
+        if edit.name != "*" and slots and world.fixed[slots[0]]:
+            refusal = f"obstacle {edit.name}: is the config's own"
+            continue
         if edit.shape is None:
-            for slot in slots:
+            for slot in [s for s in slots if not world.fixed[s]]:
                 world = _without(world, slot)
             if not slots and edit.name != "*":
                 refusal = f"no obstacle is named {edit.name}"
@@ -67,21 +75,21 @@ def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
     shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
     moving[slot] = bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
     names = (*world.names[:slot], edit.name, *world.names[slot + 1 :])
-    return World(with_shape(world.obstacles, slot, shape), names, age, moving)
+    return world._replace(obstacles=with_shape(world.obstacles, slot, shape), names=names, age=age, moving=moving)
 
 
 def _without(world: World, slot: int) -> World:
     names = (*world.names[:slot], "", *world.names[slot + 1 :])
     moving = world.moving.copy()
     moving[slot] = False
-    return World(without(world.obstacles, slot), names, world.age, moving)
+    return world._replace(obstacles=without(world.obstacles, slot), names=names, moving=moving)
 
 
 def advanced(world: World, dt: float) -> World:
     """Return the table dt [s] later: poses extrapolated, observations older."""
     if not scan.any_set(world.moving):
         return world
-    return World(advance(world.obstacles, dt), world.names, world.age + dt * world.moving, world.moving)
+    return world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving)
 
 
 def distance_from(world: World, x: F64) -> F64:
