@@ -96,13 +96,18 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         service = stack.enter_context(closing(Service(robot.dt)))
         service.ready(f"{robot.name}: IDLE")
         say(f"rtctl: ready, log {recorder.stats().path}")
-        code = EXIT_FAILED
+        code, failure = EXIT_FAILED, None
+        slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
         try:
-            slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
             code = _loop(servo, console, service, recorder, signals, slots, lockstep)
+        except Exception as error:
+            failure = error  # told when the drives are safe: to tell it reads files
+            _fallback(servo, recorder, slots, lockstep)
         finally:
             _stop_frames(link, robot, recorder)
             stats = recorder.close("stopped" if code == EXIT_OK else "failed")
+    if failure is not None:
+        say("".join(traceback.format_exception(failure)).rstrip(), to=2)
     say(_summary(servo, stats.path, stats.dropped))
     return code
 
@@ -150,12 +155,7 @@ def _loop(
         if signals.take():
             request = request._replace(verb=Verb.TERM)
             service.stopping()
-        try:
-            servo.turn(slot, request)
-        except Exception:
-            _fallback(servo, recorder, slot, slots, lockstep)
-            say(traceback.format_exc().rstrip(), to=2)
-            return EXIT_FAILED
+        servo.turn(slot, request)
         console.answer(not servo.memory.verdict, servo.memory.verdict)
         recorder.beat(time.monotonic_ns())
         service.kick(slot.slot)
@@ -179,17 +179,17 @@ def _review(servo: Servo, recorder: Recorder) -> None:
         recorder.spawn()
 
 
-def _fallback(servo: Servo, recorder: Recorder, slot: Slot, slots: Iterator[Slot], lockstep: bool) -> None:
-    """A tick raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
+def _fallback(servo: Servo, recorder: Recorder, slots: Iterator[Slot], lockstep: bool) -> None:
+    """A turn raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
 
     -D qd + g through the permitter, from the feedback alone: nothing of the tick that failed is used.
     """
     robot, m = servo.robot, servo.memory
-    driven = bool((servo.link.read(slot.slot, 0, 0.0, 0.0).drive == 1).all())
-    g, sent, rest = m.model.g, m.sent[0], 0
+    g, sent, rest, driven = m.model.g, m.sent[0], 0, True
     for k, turn in enumerate(slots):
         feedback = servo.link.read(turn.slot, turn.missed, turn.lateness, 0.0)
         recorder.put_many(CAN_RX, servo.link.received, time.monotonic_ns())
+        driven = bool((feedback.drive == 1).all()) if k == 0 else driven
         rest = rest + 1 if bool((np.abs(feedback.qd) < 0.03).all()) else 0
         if not driven or rest * robot.dt > 0.1 or k * robot.dt > robot.stop.time:
             return

@@ -212,13 +212,18 @@ def test_a_killed_controller_leaves_a_whole_log_and_its_successor_comes_up_idle(
 
 def test_a_tick_that_raises_ends_in_a_damped_stop_with_the_drives_disabled(tmp_path: Path) -> None:
     script = """
-import sys
+import sys, time, traceback
 from rtctl import cli, servo
+told = traceback.TracebackException.__init__
+def slowly(*args, **options):
+    time.sleep(1.5)  # sources on a slow disk: longer than the drives wait
+    told(*args, **options)
+traceback.TracebackException.__init__ = slowly
 tick, count = servo.tick, 0
 def raising(robot, memory, feedback, request):
     global count
     count += memory.goal is not None
-    if count > 150:
+    if count > 300:
         raise ZeroDivisionError("injected")
     return tick(robot, memory, feedback, request)
 servo.tick = raising
