@@ -132,7 +132,7 @@ def venue() -> vcan.Venue:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Outside, stand-ins take the place of the tests that need SocketCAN, last: they have run beside the others by then."""
+    """Outside, stand-ins take the place of the tests that need SocketCAN, last: done by then."""
     if INSIDE:
         return
     for i, item in enumerate(items):
