@@ -99,8 +99,10 @@ class Plant:
         self.step_ns = settings.period_ns // n_steps
         self.substeps = n_steps
         self._engine()
-        self.body = self._load(rewrite(settings))
+        urdf = rewrite(settings)
+        self.body = self._load(urdf)
         self._identify()
+        self._inertias(urdf)
         self.time_ns = 0
         self.scene_ns = 0  # time on the scenario's clock: where the obstacles are
         self.solids = [solid(dict(o), settings) for o in obstacles]
@@ -136,7 +138,7 @@ class Plant:
                 file.write(urdf)
             try:
                 with silent():
-                    flags = pb.URDF_USE_INERTIA_FROM_FILE
+                    flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_IMPLICIT_CYLINDER
                     return int(pb.loadURDF(path, useFixedBase=True, flags=flags, physicsClientId=self.client))
             except pb.error as error:
                 raise SettingsError(f"{self.settings.urdf}: {error}") from error
@@ -169,6 +171,27 @@ class Plant:
             pb.setJointMotorControl2(self.body, i, pb.VELOCITY_CONTROL, force=0.0, physicsClientId=self.client)
         self.moving = frozenset(i for i in self.links if self._chain(i))
         self.armature = np.array([j.armature for j in self.settings.joints])
+        self.friction = np.array([j.friction for j in self.settings.joints])
+        self.motors = bool(self.armature.any() or self.friction.any())
+
+    def _inertias(self, urdf: str) -> None:
+        """Give links the tensor of the URDF where pybullet replaced it by zero.
+
+        It does so, with no more than a warning, where the largest moment is more than the sum of the others: published
+        identifications have such links.
+        """
+        frames = {name: i for i, name in self.links.items()}
+        for link in ET.fromstring(urdf).findall("link"):
+            tensor = link.find("inertial/inertia")
+            i = frames.get(link.get("name", ""), -1)
+            if tensor is None or i < 0:
+                continue
+            wanted = [float(tensor.get(k, "0")) for k in ("ixx", "iyy", "izz")]
+            if not any(wanted) or any(pb.getDynamicsInfo(self.body, i, physicsClientId=self.client)[2]):
+                continue
+            if any(float(tensor.get(k, "0")) for k in ("ixy", "ixz", "iyz")):
+                raise SettingsError(f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor")
+            pb.changeDynamics(self.body, i, localInertiaDiagonal=wanted, physicsClientId=self.client)
 
     def _joints(self) -> int:
         return int(pb.getNumJoints(self.body, physicsClientId=self.client))
@@ -192,8 +215,8 @@ class Plant:
 
         Drag is a velocity motor towards zero speed with a bounded force: it brakes and holds, and never drives.
         """
-        if self.armature.any():
-            torque = self._with_armature(torque)
+        if self.motors:
+            torque = self._with_motors(torque)
         pb.setJointMotorControlArray(
             self.body, self.index, pb.TORQUE_CONTROL, forces=torque, physicsClientId=self.client
         )
@@ -212,14 +235,14 @@ class Plant:
         self.time_ns += self.step_ns
         self._read()
 
-    def _with_armature(self, torque: Sequence[float]) -> list[float]:
-        """Return the torques that move the arm as if each joint also carried its motor's inertia.
+    def _with_motors(self, torque: Sequence[float]) -> list[float]:
+        """Return the torques that move the arm as if each joint also carried its motor's inertia and friction.
 
-        (A + diag(J G^2)) qdd = tau - h - g; pybullet, which knows A alone, gets tau - J G^2 qdd.
+        (A + diag(J G^2)) qdd = tau - B G^2 qd - h - g; pybullet, which knows A alone, gets tau - B G^2 qd - J G^2 qdd.
         """
         A = np.array(pb.calculateMassMatrix(self.body, self.q, physicsClientId=self.client))
         bias = pb.calculateInverseDynamics(self.body, self.q, self.qd, [0.0] * len(self.q), physicsClientId=self.client)
-        tau = np.asarray(torque, dtype=np.float64)
+        tau = np.asarray(torque, dtype=np.float64) - self.friction * np.array(self.qd)
         qdd = np.linalg.solve(A + np.diag(self.armature), tau - np.array(bias))
         result: list[float] = (tau - self.armature * qdd).tolist()
         return result

@@ -38,6 +38,7 @@ class JointSetting(NamedTuple):
     q_min: float  # [rad] permitted range; the mechanical stops lie outside it
     q_max: float
     armature: float  # [kg m^2] motor inertia seen at the joint
+    friction: float  # [Nms/rad] viscous, seen at the joint
 
 
 class Settings(NamedTuple):
@@ -135,7 +136,13 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
         base_position=tuple(map(float, base.get("position_m", (0.0, 0.0, 0.0)))),  # type: ignore[arg-type]
         base_wxyz=quaternion(base),
         joints=tuple(
-            JointSetting(j["name"], float(j["q_min_rad"]), float(j["q_max_rad"]), float(j.get("armature_kg_m2", 0.0)))
+            JointSetting(
+                j["name"],
+                float(j["q_min_rad"]),
+                float(j["q_max_rad"]),
+                float(j.get("armature_kg_m2", 0.0)),
+                float(j.get("friction_Nms_rad", 0.0)),
+            )
             for j in robot["joints"]
         ),
         ratings=tuple(_rating(j, scales, common) for j in robot["joints"]),

@@ -34,6 +34,7 @@ class Joint(Table, frozen=True, kw_only=True):
     tau_rate_Nm_s: Annotated[float, Meta(ge=1.0, le=1e6, description="largest change of torque")]
     drive: Annotated[Name, Meta(description="a drive of the catalogue or of [drives]: its scales on the wire")]
     armature_kg_m2: Annotated[float, Meta(ge=0.0, le=100.0, description="motor inertia seen at the joint, J G^2")] = 0.0
+    friction_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="viscous, seen at the joint, B G^2")] = 0.0
 
 
 class BasePose(Table, frozen=True, kw_only=True):
