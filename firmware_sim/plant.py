@@ -190,7 +190,9 @@ class Plant:
             if not any(wanted) or any(pb.getDynamicsInfo(self.body, i, physicsClientId=self.client)[2]):
                 continue
             if any(float(tensor.get(k, "0")) for k in ("ixy", "ixz", "iyz")):
-                raise SettingsError(f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor")
+                raise SettingsError(
+                    f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor"
+                )
             pb.changeDynamics(self.body, i, localInertiaDiagonal=wanted, physicsClientId=self.client)
 
     def _joints(self) -> int:

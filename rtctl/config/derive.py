@@ -15,6 +15,7 @@ from rtctl.control.estimator import JointParams, design, design_joint, tip_param
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
 from rtctl.control.law import prepared
+from rtctl.control.mobility import Mobility, mobility
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own, nothing, watched
@@ -73,6 +74,7 @@ def build(config: Config, path: str | Path) -> Robot:
         q_rest=home.copy() if rest is None else np.array(rest),
         base=np.array(config.robot.base_pose.position_m),
         reach=_reach(config, body),
+        mobility=_mobility(config, body, home),
         body=body,
         points=points,
         coverage=coverage,
@@ -214,6 +216,11 @@ def _reach(config: Config, body: RigidBody) -> float:
         total += float(np.linalg.norm(t - base if parent == 0 else t))
         joint = parent
     return total
+
+
+def _mobility(c: Config, body: RigidBody, home: F64) -> Mobility:
+    q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
+    return mobility(body, q_min, q_max, home, c.motion.length_m)
 
 
 def _motion(c: Config) -> MotionParams:

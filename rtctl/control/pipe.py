@@ -90,7 +90,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
 
 def _space(robot: Robot, task: Task, model: Model) -> OperationalSpace:
     rows = 3 if task == Task.POSITION else 6
-    return operational_space(model.J, model.A_inv, model.Lambda_inv, rows, robot.motion)
+    rank = int(robot.mobility.rank[(1 << rows) - 1])
+    return operational_space(model.J, model.A_inv, model.Lambda_inv, rows, robot.motion, rank)
 
 
 def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> Memory:

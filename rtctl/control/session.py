@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rtctl.control import faults, goals, scan, supervisor, world
+from rtctl.control import faults, goals, mobility, scan, supervisor, world
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
@@ -168,6 +168,7 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         verdict = "goal: a joint is still beyond its limits"
     rho = world.distance_from(m.world, goal.position)
     verdict = verdict or goals.refusal(goal, robot.base, robot.reach, rho, m.world.names)
+    verdict = verdict or mobility.refusal(goal, robot.mobility)
     if verdict:
         return m._replace(verdict=verdict)
     return m._replace(goal=goal, goal_rho=rho, status=Status.MOVING, blocker=-1, still=0)
