@@ -15,7 +15,7 @@ from rtctl.control.linalg import matvec
 from rtctl.control.model import Model
 from rtctl.control.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
 from rtctl.control.primitives import Obstacles
-from rtctl.control.robot import Robot
+from rtctl.control.robot import JOINTS_MAX, Robot
 from rtctl.types import F64, I64, Cut, Record
 
 SPEED_BAND = 0.9  # fraction of qd_max that the guard lets joints have
@@ -172,6 +172,8 @@ def evaluate_law(
 def prepared(robot: Robot) -> Robot:
     """Return the robot with the constants of the law as one record: numba takes one array in a tenth of the time.
 
+    Arrays over joints are padded to JOINTS_MAX: one layout, whatever the arm. numba names compiled code by a number
+    that it gives each record type in each process, so that of two layouts from its cache one would run as the other.
     Whoever replaces a gain or bound of a robot prepares it anew.
     """
     groups: dict[str, Any] = {
@@ -182,19 +184,22 @@ def prepared(robot: Robot) -> Robot:
     }
     values = {f"{group}_{k}": v for group, params in groups.items() for k, v in params._asdict().items()}
     values |= {k: getattr(robot, k) for k in ("q_min", "q_max", "qd_max", "tau_max", "braking", "dt")}
-    constants = np.zeros(1, [(k, np.float64, np.shape(v)) for k, v in values.items()])
+    constants = np.zeros(1, [(k, np.float64, (JOINTS_MAX,) * np.ndim(v)) for k, v in values.items()])
     for k, v in values.items():
-        constants[k] = v
+        if np.ndim(v):
+            constants[k][0, : robot.n] = v
+        else:
+            constants[k] = v
     return robot._replace(constants=constants)
 
 
 @njit(cache=True, fastmath=False)
-def _params(c: Any) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
+def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
     """Return the parameters that `prepared` put into the record c."""
     return (
         MotionParams(
             c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max,
-            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture.copy(), c.motion_epsilon, c.motion_length,
+            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture[:n].copy(), c.motion_epsilon, c.motion_length,
             c.motion_speed_margin,
         ),
         FieldParams(
@@ -206,7 +211,8 @@ def _params(c: Any) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams
             c.own_m_max,
         ),
         LimitParams(
-            c.limit_rho0.copy(), c.limit_rho_min.copy(), c.limit_rho_num.copy(), c.limit_eta.copy(), c.limit_k_d.copy()
+            c.limit_rho0[:n].copy(), c.limit_rho_min[:n].copy(), c.limit_rho_num[:n].copy(), c.limit_eta[:n].copy(),
+            c.limit_k_d[:n].copy(),
         ),
     )  # fmt: skip
 
@@ -221,10 +227,10 @@ def _evaluate(
 
     One compiled call with few results: crossing the border costs as much as a term, and a tenth of that per array.
     """
-    c = constants[0]
-    p, avoid, self_avoid, limit = _params(c)
-    q_min, q_max, tau_max, braking = c.q_min.copy(), c.q_max.copy(), c.tau_max.copy(), c.braking.copy()
-    qd_max, dt = pace * c.qd_max.copy(), c.dt
+    c, n = constants[0], q.shape[0]
+    p, avoid, self_avoid, limit = _params(c, n)
+    q_min, q_max, tau_max, braking = c.q_min[:n].copy(), c.q_max[:n].copy(), c.tau_max[:n].copy(), c.braking[:n].copy()
+    qd_max, dt = pace * c.qd_max[:n], c.dt
     qd_free = qd - matvec(space.Jbar, np.concatenate((xd, omega)))
     v, w = velocity_reference(
         e, e_rot, v_ref, w_ref, space.Jbar, qd_free, qd_max, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max,

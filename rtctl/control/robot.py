@@ -14,6 +14,7 @@ from rtctl.control.own import Own
 from rtctl.control.points import Coverage, Points
 from rtctl.types import F64, Record, Shape
 
+JOINTS_MAX = 15  # of any arm: motor ids have four bits
 SLOTS = 64  # obstacle slots: the size of every array over obstacles
 
 
