@@ -16,7 +16,7 @@ import numpy as np
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
 from rtctl.config import Config
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.limits import permit, slew_reference
 from rtctl.control.pipe import warm
 from rtctl.control.robot import Robot
@@ -77,7 +77,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         stack.enter_context(InstanceLock(bus_resource(config.link.interface, config.link.channel), "link.channel"))
         robot = cfg.build(config, path)
         warm(robot)
-        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot)
+        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes)
         console = stack.enter_context(
             closing(Console(config.console.socket or default_path(robot.name), robot.dt, bounds))
         )
@@ -229,6 +229,7 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
     """Return what `rtctl status` shows."""
     m, robot = servo.memory, servo.robot
     goal = m.goal
+    error, error_rot = servo.errors()
     stats = recorder.stats()
     return {
         "robot": robot.name,
@@ -242,8 +243,9 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "wxyz": quat_of(m.tip.R),
         "speed_m_s": float(np.linalg.norm(m.tip.xd)),
         "goal_m": None if goal is None else goal.position,
-        "error_m": None if goal is None else float(np.linalg.norm(goal.position - m.tip.x)),
-        "error_rad": servo.error_rot(),
+        "task": None if goal is None else task.names(goal.task),
+        "error_m": error,
+        "error_rad": error_rot,
         "clearance_m": {
             name: float(d) for name, d in zip(m.world.names, m.rho, strict=True) if name and np.isfinite(d)
         },

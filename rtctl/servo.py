@@ -7,11 +7,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.memory import Memory
 from rtctl.control.pipe import initial, tick
 from rtctl.control.robot import Robot
-from rtctl.control.so3 import error_to
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import Slot
 from rtctl.log.request import encode_event, encode_request
@@ -93,12 +92,13 @@ class Servo:
         self.compute = time.perf_counter() - begin
         return Turn(feedback, command, record, frames)
 
-    def error_rot(self) -> float | None:
-        """Return the angle [rad] to the goal's orientation, None when it asks for none."""
+    def errors(self) -> tuple[float | None, float | None]:
+        """Return the distance [m] and the angle [rad] to the goal, None for what it leaves free."""
         m = self.memory
-        if m.goal is None or m.goal.task == Task.POSITION:
-            return None
-        return float(np.linalg.norm(error_to(m.tip.R, m.goal.wxyz)))
+        if m.goal is None:
+            return None, None
+        error, error_rot = task.error_of(m.goal, m.tip.x, m.tip.R)
+        return error if m.goal.task & Task.POSITION else None, error_rot if task.turns(m.goal.task) else None
 
     def _log(
         self,
@@ -137,7 +137,9 @@ def _news(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> li
 
 
 def blocker_name(robot: Robot, m: Memory) -> str:
-    """Return the name of the obstacle or joint that holds the arm, '' for none."""
+    """Return the name of the obstacle, joint or lost direction that holds the arm, '' for none."""
+    if m.status == Status.SINGULAR and m.goal is not None:
+        return task.lost_words(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)
     if m.blocker < 0:
         return ""
     if m.status in (Status.LIMITED, Status.SATURATED):

@@ -14,15 +14,15 @@ import numpy as np
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
 from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.robot import Robot
-from rtctl.control.so3 import R_of, error, quat_of
+from rtctl.control.so3 import R_of, quat_of
 from rtctl.errors import ConfigError, RtctlError
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import lockstep
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn
-from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Task, Truth, Verb
+from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
 ARM_TIME = 2.0  # [s] within which the robot must be running
@@ -121,13 +121,10 @@ def _r(value: float) -> float | None:
 def _advanced(leg: _Leg, truth: Truth) -> _Leg:
     """Return the leg after a period: distance to the goal, to the line, and since when it has been there."""
     goal = leg.goal
-    e = float(np.linalg.norm(goal.position - truth.tip))
-    e_rot = 0.0
-    if goal.task == Task.POSE:
-        e_rot = float(np.linalg.norm(error(R_of(truth.tip_wxyz), R_of(goal.wxyz))))
-    along = goal.position - leg.start
+    e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
+    along = task.point_of(goal, leg.start) - leg.start
     length = float(np.linalg.norm(along))
-    offset = truth.tip - leg.start
+    offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
     if length > 1e-9:
         offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
     there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
@@ -160,6 +157,7 @@ class Feed:
         due = self.pending and truth.time >= self.pending[0].at_s
         if due and m.state == State.RUN and not m.outside:
             goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
+            goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
             self.waiting = (goal, truth.time, truth.tip.copy())
         return Request(verb, goal, self._seen(truth))
 

@@ -3,7 +3,7 @@
 Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
 """
 
-from enum import IntEnum, IntFlag
+from enum import STRICT, IntEnum, IntFlag
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -103,21 +103,34 @@ class Drive(IntEnum):
     CLEAR = 3  # clear a latched drive fault
 
 
-class Task(IntEnum):
-    """Which part of the pose the goal constrains."""
+class Task(IntFlag, boundary=STRICT):
+    """What of the tip's motion a goal constrains, in world axes; the rest is the posture's."""
 
-    POSITION = 0
-    POSE = 1
+    X = 1
+    Y = 2
+    Z = 4
+    RX = 8
+    RY = 16
+    RZ = 32
+    DIRECTION = 64  # where an axis of the tool points; the roll about it is free
+    POSITION = X | Y | Z
+    ORIENTATION = RX | RY | RZ
+    POSE = POSITION | ORIENTATION
+
+
+TOOL_Z = np.array([0.0, 0.0, 1.0])
+TOOL_Z.setflags(write=False)
 
 
 class Goal(NamedTuple):
     """A goal pose of the tip in the world frame."""
 
-    position: F64  # (3,) [m]
-    wxyz: F64  # (4,) unit quaternion; ignored for Task.POSITION
+    position: F64  # (3,) [m]; what the task leaves out means nothing
+    wxyz: F64  # (4,) unit quaternion; for Task.DIRECTION any that turns `axis` there
     task: Task
     tolerance: float  # [m] arrived within this and within tolerance_rot
     tolerance_rot: float  # [rad]
+    axis: F64 = TOOL_Z  # (3,) unit vector in the tip's frame, for Task.DIRECTION
 
 
 class Shape(NamedTuple):

@@ -48,7 +48,7 @@ def law_at(q: F64, qd: F64 | None = None, balls: tuple[tuple[float, ...], ...] =
     arm = robot()
     qd = np.zeros(7) if qd is None else qd
     model = model_at(q, qd)
-    space = operational_space(model.J, model.A_inv, model.Lambda_inv, changes.pop("rows", 6), arm.motion)
+    space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6)[: changes.pop("rows", 6)], arm.motion)
     twist = model.J @ qd
     inputs: dict[str, Any] = {
         "model": model, "space": space, "obstacles": space_of(balls), "q": q, "qd": qd, "xd": twist[:3],
@@ -93,7 +93,7 @@ def test_what_is_kept_never_drives_an_arm_that_nothing_is_near():
             continue
         model = model_at(inside, slow)
         # J^T Lambda Jd qd belongs to the brake and is no dissipation; it goes with the square of the speed
-        frozen = model.J.T @ operational_space(model.J, model.A_inv, model.Lambda_inv, 6, robot().motion).Lambda
+        frozen = model.J.T @ operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), robot().motion).Lambda
         power = slow @ (law.keep - model.g - model.h + frozen @ model.Jdqd)
         assert power <= 1e-9
 

@@ -20,7 +20,7 @@ from rtctl.log import read, segments
 from rtctl.log.replay import inputs
 from rtctl.servo import first_feedback
 from rtctl.sim import simulate
-from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Record, Request, State, Verb
+from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Record, Request, State, Task, Verb
 from tests.arms import PANDA_HOME
 from tests.lab import DOWN, PANDA, Lab, Standing, at_rest, goal, healthy, lab, leaves, robot, same, seen, sphere
 
@@ -131,6 +131,8 @@ def eventful(here: Lab) -> Lab:
     here.step(missed=2)
     here.ask([0.45, 0.0, 0.6])
     here.run(0.2)
+    here.step(Request(goal=goal(here.memory, [0.45, 0.0, 0.6])._replace(task=Task.X | Task.DIRECTION, axis=DOWN[:3])))
+    here.run(0.1)
     for _ in range(3):
         here.step(missed=1)
     here.run(0.3)

@@ -194,7 +194,7 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         ball = shape(f"ball{k}", "sphere", (0.05,), model.P[j] + away, 0.1 * rng.normal(size=3))
         obstacles = with_shape(obstacles, k, ball)
     small = robot._replace(points=points, slots=slots, scratch=field_buffers(slots, m, robot.n))
-    space = operational_space(model.J, model.A_inv, model.Lambda_inv, 6, robot.motion)
+    space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), robot.motion)
     twist = model.J @ qd
     e, e_rot = np.array([0.1, 0.2, -0.05]), np.array([0.1, 0.0, 0.2])
     v_ref, w_ref = np.array([0.05, 0.05, 0.0]), np.array([0.1, 0.0, 0.1])

@@ -273,7 +273,7 @@ def _error(axes: Axes, trace: Trace, outcome: Outcome, colours: dict[str, str]) 
     for g, end in zip(taken, ends, strict=True):
         start = trace.at(g.given.slot)
         part = slice(start, max(start + 1, min(end, int(np.flatnonzero(trace.running)[-1]) + 1)))
-        e = trace.error(part, trace.goals[g.given.slot].position)
+        e, _ = trace.errors(part, trace.goals[g.given.slot])
         axes.plot(*_curve(trace.time[part], np.maximum(e * 1e3, 1e-3), np.max), color=BLUE, lw=1.6)
     axes.set_yscale("log")
     axes.set_ylim(0.02, 2000.0)

@@ -9,7 +9,8 @@ import numpy as np
 from rtctl.config import Config
 from rtctl.config.obstacles import shape_of
 from rtctl.control import faults, world
-from rtctl.control.so3 import R_of, error
+from rtctl.control.so3 import R_of
+from rtctl.control.task import error_of
 from rtctl.errors import LogError
 from rtctl.log import read, segments
 from rtctl.log.replay import requests_of
@@ -77,15 +78,10 @@ class Trace(NamedTuple):
         """Return the first tick at or after a slot of the grid."""
         return int(np.searchsorted(self.slot, slot))
 
-    def error(self, part: slice, goal: F64) -> F64:
-        """Return the distance [m] of the tip to a goal (3,) in a stretch of ticks."""
-        distance: F64 = np.sqrt(((self.x[part] - goal) ** 2).sum(1))
-        return distance
-
-    def error_rot(self, part: slice, wxyz: F64) -> F64:
-        """Return the angle [rad] to a goal's orientation (4,) in a stretch of ticks."""
-        R = R_of(wxyz)
-        return np.array([float(np.linalg.norm(error(R_of(w), R))) for w in self.wxyz[part]])
+    def errors(self, part: slice, goal: Goal) -> tuple[F64, F64]:
+        """Return distance [m] and angle [rad] of the tip to a goal in a stretch of ticks, 0 where the goal is free."""
+        both = np.array([error_of(goal, x, R_of(w)) for x, w in zip(self.x[part], self.wxyz[part], strict=True)])
+        return both[:, 0], both[:, 1]
 
 
 def trace(path: Path | str, config: Config, began: int) -> Trace:

@@ -25,20 +25,24 @@ def add(commands: Commands) -> None:
     for verb, text in VERBS.items():
         add_daemon(command(commands, verb, text, f"rtctl {verb} --robot panda", _verb))
     example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
-    goal = command(commands, "goal", "send the tip to a position [m], or a pose", example, _goal)
+    goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
         goal.add_argument(axis, metavar=axis.upper(), type=number, help="in the world frame [m]")
     turn = goal.add_mutually_exclusive_group()
     turn.add_argument("--rpy", metavar=("R", "P", "Y"), nargs=3, type=number, help="roll, pitch, yaw [rad]")
     turn.add_argument("--wxyz", metavar=("W", "X", "Y", "Z"), nargs=4, type=number, help="unit quaternion")
     turn.add_argument("--hold-orientation", action="store_true", help="keep the present orientation")
+    turn.add_argument("--direction", metavar=("X", "Y", "Z"), nargs=3, type=number, help="where the tool's axis points")
+    goal.add_argument("--tool-axis", metavar="AXIS", help="that axis of the tip: x y z -x -y -z (z)")
+    goal.add_argument("--axes", metavar="AXES", help="of X Y Z those that count: xy, z, …; none: orientation alone")
     goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
     _add_waiting(goal)
     goal.add_argument("--wait", action="store_true", help="return when the tip has arrived; exit code 1 if it does not")
     goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
-        'x,y,z,w,x,y,z; under a header of such names; or JSON: {"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
+        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, tool_axis, axes, tolerance_m); or JSON:\n"
+        '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
     )
     goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
     _add_waiting(goals)
@@ -109,12 +113,22 @@ def _clear(arguments: argparse.Namespace) -> int:
 
 def _goal(arguments: argparse.Namespace) -> int:
     from rtctl.cli.goals import Outcome, send, send_and_wait
+    from rtctl.cli.values import letters
     from rtctl.hal.client import Session
 
     message: dict[str, Any] = {"verb": "goal", "position_m": [arguments.x, arguments.y, arguments.z]}
-    for key, value in (("rpy_rad", arguments.rpy), ("wxyz", arguments.wxyz), ("tolerance_m", arguments.tolerance)):
-        if value is not None:
-            message[key] = value
+    if arguments.axes == "none":
+        del message["position_m"]
+    elif arguments.axes is not None:
+        message["axes"] = letters(arguments.axes)
+    asked = {
+        "rpy_rad": arguments.rpy,
+        "wxyz": arguments.wxyz,
+        "direction": arguments.direction,
+        "tool_axis": arguments.tool_axis,
+        "tolerance_m": arguments.tolerance,
+    }
+    message |= {key: value for key, value in asked.items() if value is not None}
     if arguments.hold_orientation:
         message["hold"] = "orientation"
     with Session(daemon_of(arguments), arguments.reply) as session:

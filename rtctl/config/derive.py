@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.config import rules
+from rtctl.config.goal import task_of
 from rtctl.config.obstacles import quaternion, shape_of
 from rtctl.config.read import name_place
 from rtctl.config.structs import Config
@@ -97,6 +98,7 @@ def build(config: Config, path: str | Path) -> Robot:
         scratch=field_buffers(SLOTS, len(points.link), len(joints)),
         tolerance=config.motion.tolerance_m,
         tolerance_rot=config.motion.tolerance_rad,
+        axes=task_of(config.motion.axes),
     )
     return prepared(robot)
 
@@ -220,7 +222,7 @@ def _reach(config: Config, body: RigidBody) -> float:
 
 def _mobility(c: Config, body: RigidBody, home: F64) -> Mobility:
     q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
-    return mobility(body, q_min, q_max, home, c.motion.length_m)
+    return mobility(body, q_min, q_max, home)
 
 
 def _motion(c: Config) -> MotionParams:

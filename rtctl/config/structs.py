@@ -15,6 +15,7 @@ Key = Annotated[str, Meta(min_length=1, max_length=64)]  # a name inside the URD
 Angle = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Angles = Annotated[tuple[Angle, ...], Meta(min_length=1, max_length=15)]
 Rate = Annotated[float, Meta(ge=10.0, le=4000.0)]
+Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 Milliseconds = Annotated[float, Meta(ge=0.1, le=1000.0)]
 
 
@@ -112,6 +113,10 @@ class Motion(Table, frozen=True, kw_only=True):
     )
     singular_1_kg: Annotated[float, Meta(ge=1e-4, le=10.0, description="eigenvalue of J A^-1 J^T damped below")] = 0.02
     length_m: Annotated[float, Meta(ge=0.01, le=2.0, description="makes angular rows comparable to linear ones")] = 0.2
+    axes: Annotated[
+        tuple[Axis, ...],
+        Meta(min_length=1, max_length=6, description="world axes along (x) and about (rx) which the tip can move"),
+    ] = ("x", "y", "z", "rx", "ry", "rz")
     posture: Posture = Posture()
 
 

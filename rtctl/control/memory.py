@@ -35,6 +35,7 @@ class Memory(NamedTuple):
     model: Model
     space: OperationalSpace
     task: Task  # that `space` was evaluated for
+    axis: F64  # (3,) of the tool that goes with it
     evaluated: bool  # the model, this tick
     phase: float  # model periods since the last evaluation was due, in (-1, 0]
     qdd: F64  # (n,) [rad/s2] predicted from the torque of the last command

@@ -27,8 +27,11 @@ from rtctl.control.session import (
     supervised,
     with_goal,
 )
-from rtctl.control.so3 import error_to, quat_of
+from rtctl.control.so3 import quat_of
+from rtctl.control.task import error_of, lost_of, point_of, selected, selection, task_error
 from rtctl.types import (
+    F64,
+    TOOL_Z,
     Command,
     Drive,
     Feedback,
@@ -48,6 +51,7 @@ BRAKING = (State.STOPPING, State.SAFE_STOP)
 ZERO = np.zeros(3)
 START_PACE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
+LOST = 0.5  # share of the error in lost directions from which an arm at rest is held by its singularity
 MISSED_MAX = 10  # slots that estimates coast through; more is a fault
 
 
@@ -75,23 +79,22 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     model = robot.body.evaluate(q, zero, robot.points, robot.own)
     joints, tip = joint_start(q, robot.joint_P), start(model.x, model.R, robot.tip_design)
     table = world.with_static(world.empty(robot.slots), robot.obstacles)
-    space = _space(robot, Task.POSE, model)
+    space = _space(robot, robot.axes, TOOL_Z, model)
     far = np.full(robot.slots, np.inf)
     return Memory(
         tick=-1, state=State.IDLE, since=-1, reaction=Severity.NONE, off=False, in_force=0,
         good=np.full(len(FAULTS), 1 << 30), counters=Counters(), clear_until=-1, recovering=False, outside=False,
         leaving=False, done=False, verdict="", joints=joints, tip=tip, innovation=0.0, model=model, space=space,
-        task=Task.POSE, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
-        goal=None, hold=hold_at(model.x, model.R),
+        task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
+        goal=None, hold=hold_at(model.x, model.R, robot.axes),
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
         rho=far, sent=np.zeros((4, robot.n)), cut=0, pace=START_PACE,
     )  # fmt: skip
 
 
-def _space(robot: Robot, task: Task, model: Model) -> OperationalSpace:
-    rows = 3 if task == Task.POSITION else 6
-    rank = int(robot.mobility.rank[(1 << rows) - 1])
-    return operational_space(model.J, model.A_inv, model.Lambda_inv, rows, robot.motion, rank)
+def _space(robot: Robot, task: Task, axis: F64, model: Model) -> OperationalSpace:
+    S = selection(int(task), axis, model.R)
+    return operational_space(model.J, model.A_inv, model.Lambda_inv, S, robot.motion)
 
 
 def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> Memory:
@@ -100,10 +103,12 @@ def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> M
         m.joints, m.qdd, feedback.q, feedback.qd, feedback.age, feedback.replies > 0, elapsed, robot.joint_filter
     )
     phase = m.phase + robot.dt / robot.model_dt
-    task = m.goal.task if m.goal is not None else m.hold.task
+    target = m.goal if m.goal is not None else m.hold
+    task, axis = target.task, target.axis
+    changed = task != m.task or (axis is not m.axis and bool((axis != m.axis).any()))
     due = phase > 0.0
     model = robot.body.evaluate(joints.q, joints.qd, robot.points, robot.own) if due else m.model
-    space = _space(robot, task, model) if due or task != m.task else m.space
+    space = _space(robot, task, axis, model) if due or changed else m.space
     tip, innovation = tip_step(m.tip, m.model.J, m.model.Jdqd, m.qdd, model.J, joints.qd, elapsed, robot.estimator)
     innovation = max(innovation, scan.largest(surprise))
     if due:  # evaluated at the state of this slot: its age is zero
@@ -111,7 +116,7 @@ def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> M
         innovation = max(innovation, other)
     return m._replace(
         joints=joints, tip=tip, innovation=innovation, model=model, space=space, task=task,
-        evaluated=due, phase=phase - 1.0 if due else phase,
+        axis=axis, evaluated=due, phase=phase - 1.0 if due else phase,
     )  # fmt: skip
 
 
@@ -120,7 +125,7 @@ def _perceived(robot: Robot, m: Memory, request: Request, elapsed: float) -> Mem
     table, verdict = world.advanced(m.world, elapsed), m.verdict
     if request.obstacles:
         table, verdict = world.edited(table, request.obstacles)
-    rho = m.goal_rho if m.goal is None else world.distance_from(table, m.goal.position)
+    rho = m.goal_rho if m.goal is None else world.distance_from(table, point_of(m.goal, m.tip.x))
     return m._replace(world=table, verdict=verdict, goal_rho=rho)
 
 
@@ -131,11 +136,12 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
     m = m._replace(pace=_pace(robot, m))
     slow = braking and max(np.abs(m.v_ref).max(), np.abs(m.w_ref).max()) < 1e-3
     if braking and not slow:
-        m = held_here(m)  # the hold begins where the braking ends
+        m = held_here(robot, m)  # the hold begins where the braking ends
     target = m.goal if pursuing and m.goal is not None else m.hold
     hasten = not braking or slow  # while braking the references only fall to zero
-    e = target.position - m.tip.x if hasten else ZERO
-    e_rot = error_to(m.tip.R, target.wxyz) if m.task == Task.POSE and hasten else ZERO
+    e, e_rot = ZERO, ZERO
+    if hasten:
+        e, e_rot = task_error(int(m.task), m.axis, target.position, target.wxyz, m.tip.x, m.tip.R)
     law = evaluate_law(
         robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
         m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
@@ -191,19 +197,20 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Memor
 
 def _progress(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Progress:
     assert m.goal is not None
-    pose = m.goal.task == Task.POSE
+    error, error_rot = error_of(m.goal, m.tip.x, m.tip.R)
+    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
     return Progress(
-        error=scan.norm(m.goal.position - m.tip.x),
-        error_rot=scan.norm(error_to(m.tip.R, m.goal.wxyz)) if pose else 0.0,
-        speed=scan.norm(m.tip.xd),
-        rate=scan.norm(m.tip.omega) if pose else 0.0,
+        error=error,
+        error_rot=error_rot,
+        speed=scan.norm(v),
+        rate=scan.norm(w),
         goal_rho=m.goal_rho,
         rho=law.rho,
         force=scan.norms(law.force),
         tau_limits=law.tau_limits,
         tau_max=robot.tau_max,
         tau_wanted=permitted.tau_wanted,
-        damped=m.space.damped,
+        damped=m.space.damped and lost_of(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)[2] > LOST,
         cut=m.cut,
         rho0=robot.avoid.rho0,
     )
@@ -214,15 +221,16 @@ def _record(
 ) -> Record:
     """Write everything that came in and went out into one struct."""
     goal = m.goal if m.goal is not None else m.hold
+    error, error_rot = error_of(goal._replace(task=m.task, axis=m.axis), m.tip.x, m.tip.R)
     return make_record(
         robot.n, robot.slots,
         tick=m.tick, slot=feedback.slot, time=feedback.slot * robot.dt, missed=feedback.missed, link=feedback.link,
         q=feedback.q, qd=feedback.qd, tau_measured=feedback.tau, age=feedback.age, replies=feedback.replies,
         drive=feedback.drive, verb=request.verb, lateness=feedback.lateness, compute=feedback.compute,
         x=m.tip.x, xd=m.tip.xd, wxyz=quat_of(m.tip.R), omega=m.tip.omega, innovation=m.innovation,
-        goal=goal.position, goal_wxyz=goal.wxyz, task=m.task, F=law.F, error=scan.norm(goal.position - m.tip.x),
-        error_rot=scan.norm(error_to(m.tip.R, goal.wxyz)) if m.task == Task.POSE else 0.0,
-        sigma_min=m.space.sigma_min, rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
+        goal=goal.position, goal_wxyz=goal.wxyz, goal_axis=goal.axis, task=m.task, F=law.F,
+        error=error, error_rot=error_rot, sigma_min=m.space.sigma_min,
+        rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
         tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
         tau_gravity=m.model.g + m.model.h, tau_wanted=permitted.tau_wanted, tau_sent=command.tau,
         command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, severity=m.reaction,
@@ -254,7 +262,7 @@ def warm(robot: Robot) -> None:
         ObstacleEdit(kind, Shape(kind, kind, np.array([0.1, 0.1, 0.1, 2.0]), far, wxyz, np.ones(3), np.ones(3)))
         for kind in primitives.TYPES
     )
-    for task in Task:
+    for task in (Task.POSE, Task.POSITION | Task.DIRECTION):
         goal = Goal(m.tip.x, quat_of(m.tip.R), task, 1e-3, 1e-2)
         moving = m._replace(state=State.RUN, goal=goal, in_force=0)
         beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))

@@ -12,7 +12,7 @@ from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own
 from rtctl.control.points import Coverage, Points
-from rtctl.types import F64, Record, Shape
+from rtctl.types import F64, Record, Shape, Task
 
 JOINTS_MAX = 15  # of any arm: motor ids have four bits
 SLOTS = 64  # obstacle slots: the size of every array over obstacles
@@ -67,4 +67,5 @@ class Robot(NamedTuple):
     scratch: Field  # work arrays of the field, overwritten every tick
     tolerance: float  # [m] of a goal that gives none
     tolerance_rot: float  # [rad]
+    axes: Task = Task.POSE  # of the tip that the arm can move
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`

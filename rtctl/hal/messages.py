@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from rtctl.config.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.config.obstacles import (
     Name,
     Obstacle,
@@ -18,10 +19,9 @@ from rtctl.config.obstacles import (
     Place,
     RollPitchYaw,
     contradiction,
-    orientation_contradiction,
-    quaternion,
     shape_of,
 )
+from rtctl.control.task import point_of, within
 from rtctl.errors import RequestError
 from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
 
@@ -60,12 +60,15 @@ class Status(_Message, tag="status", frozen=True):
 
 
 class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
-    """Move the tip; without an orientation the task is the position alone."""
+    """Move the tip: position (or `axes` of it), orientation, direction of a tool axis; the rest stays free."""
 
-    position_m: Place
+    position_m: Place | None = None
+    axes: Axes | None = None
     wxyz: Orientation | None = None
     rpy_rad: RollPitchYaw | None = None
     hold: Literal["orientation"] | None = None
+    direction: Direction | None = None
+    tool_axis: ToolAxis | None = None
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=0.1)] | None = None
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
 
@@ -99,6 +102,7 @@ class Bounds(NamedTuple):
     radius: float  # [m]
     tolerance: float  # [m]
     tolerance_rot: float  # [rad]
+    axes: Task = Task.POSE  # of the tip that the arm can move
 
 
 def decode(raw: bytes | memoryview) -> Message:
@@ -155,23 +159,18 @@ def notices_of(message: ObstacleMessage | ObstaclesMessage) -> list[Notice]:
 
 
 def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Goal:
-    away = math.dist(message.position_m, bounds.centre)
-    if away > bounds.radius:
-        raise RequestError(f"goal.position_m: got {away:.3f} m from the base, wanted at most {bounds.radius:.3f} m")
-    if found := orientation_contradiction(message.rpy_rad, message.wxyz):
+    if found := goal_contradiction(message):
         key, got, wanted = found
         raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
-    oriented = message.rpy_rad is not None or message.wxyz is not None
-    if message.hold and oriented:
-        raise RequestError("goal.hold: got an orientation beside it, wanted one of them")
-    wxyz = np.array(orientation(), dtype=np.float64) if message.hold else quaternion(message.rpy_rad, message.wxyz)
-    return Goal(
-        position=np.array(message.position_m, dtype=np.float64),
-        wxyz=wxyz,
-        task=Task.POSE if oriented or message.hold else Task.POSITION,
-        tolerance=bounds.tolerance if message.tolerance_m is None else message.tolerance_m,
-        tolerance_rot=bounds.tolerance_rot if message.tolerance_rad is None else message.tolerance_rad,
-    )
+    goal = goal_from(message, lambda: np.array(orientation()), bounds.tolerance, bounds.tolerance_rot)
+    task, why = within(goal.task, bounds.axes)
+    if why:
+        raise RequestError(why)
+    centre = np.array(bounds.centre)
+    away = math.dist(point_of(goal._replace(task=task), centre), centre)  # what is free is no further than it need be
+    if away > bounds.radius:
+        raise RequestError(f"goal.position_m: got {away:.3f} m from the base, wanted at most {bounds.radius:.3f} m")
+    return goal
 
 
 def _obstacles(message: Message) -> Iterator[tuple[str, Obstacle]]:

@@ -60,4 +60,5 @@ def _goal(body: dict[str, Any]) -> Goal:
         Task(body["task"]),
         float(body["tolerance"]),
         float(body["tolerance_rot"]),
+        np.array(body["axis"], np.float64),
     )
