@@ -29,10 +29,15 @@ PARTS = {
     "position, direction": Task.POSITION | Task.DIRECTION,
     "line, orientation": Task.Y | Task.ORIENTATION,
 }
+
+
+def unit(v: F64) -> F64:
+    """Return v with length 1."""
+    return np.asarray(v / np.linalg.norm(v), np.float64)
+
+
 numbers = st.floats(-1.0, 1.0, allow_subnormal=False)
-units = (
-    st.tuples(numbers, numbers, numbers).filter(lambda v: np.linalg.norm(v) > 0.1).map(lambda v: v / np.linalg.norm(v))
-)
+units = st.tuples(numbers, numbers, numbers).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1).map(unit)
 
 
 def turned(rotvec: F64) -> F64:
