@@ -15,9 +15,9 @@ from rtctl.config.scenario import GoalTable, parse_goal
 from rtctl.control import osc, task
 from rtctl.control.so3 import R_of
 from rtctl.errors import ConfigError
-from rtctl.types import F64, Cut, Status, Task
+from rtctl.types import F64, Cut, Goal, Request, Status, Task
 from tests.arms import PANDA_HOME
-from tests.lab import Run, play
+from tests.lab import Run, Standing, play
 from tests.test_osc import P, arm
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -249,3 +249,12 @@ def test_a_planar_arm_moves_in_its_plane_and_is_not_called_singular_for_the_rest
     assert run.figures["final_error_m"] < 1e-3
     assert not (run.record["cut"] & Cut.SINGULAR).any()
     assert {name for _, name, _ in run.events} == {"state", "moving", "arrived"}
+
+
+def test_a_goal_that_leaves_the_orientation_free_does_not_turn_the_hand_in_its_first_tick():
+    standing = Standing()
+    flipped = np.array([0.0, 0.0, 1.0, 0.0])
+    goal = Goal(standing.memory.tip.x, flipped, Task.POSITION, 0.003, 0.015)
+    standing.tick(Request(goal=goal))
+    assert standing.memory.goal is not None
+    np.testing.assert_allclose(standing.memory.w_ref, 0.0, atol=1e-6)

@@ -141,7 +141,9 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
     hasten = not braking or slow  # while braking the references only fall to zero
     e, e_rot = ZERO, ZERO
     if hasten:
-        e, e_rot = task_error(int(m.task), m.axis, target.position, target.wxyz, m.tip.x, m.tip.R)
+        e, e_rot = task_error(int(target.task), target.axis, target.position, target.wxyz, m.tip.x, m.tip.R)
+        if target.task != m.task:  # a goal of this tick: `space` is still that of the one before
+            e, e_rot = selected(int(m.task), m.axis, m.tip.R, e, e_rot)
     law = evaluate_law(
         robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
         m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
@@ -221,14 +223,14 @@ def _record(
 ) -> Record:
     """Write everything that came in and went out into one struct."""
     goal = m.goal if m.goal is not None else m.hold
-    error, error_rot = error_of(goal._replace(task=m.task, axis=m.axis), m.tip.x, m.tip.R)
+    error, error_rot = error_of(goal, m.tip.x, m.tip.R)
     return make_record(
         robot.n, robot.slots,
         tick=m.tick, slot=feedback.slot, time=feedback.slot * robot.dt, missed=feedback.missed, link=feedback.link,
         q=feedback.q, qd=feedback.qd, tau_measured=feedback.tau, age=feedback.age, replies=feedback.replies,
         drive=feedback.drive, verb=request.verb, lateness=feedback.lateness, compute=feedback.compute,
         x=m.tip.x, xd=m.tip.xd, wxyz=quat_of(m.tip.R), omega=m.tip.omega, innovation=m.innovation,
-        goal=goal.position, goal_wxyz=goal.wxyz, goal_axis=goal.axis, task=m.task, F=law.F,
+        goal=goal.position, goal_wxyz=goal.wxyz, goal_axis=goal.axis, task=goal.task, F=law.F,
         error=error, error_rot=error_rot, sigma_min=m.space.sigma_min,
         rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
         tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
