@@ -197,8 +197,13 @@ void law(const double *const *a, const double *s, const int64_t *link, int n, in
         delta[i] = tn[i] > high ? high - tn[i] : tn[i] < low ? low - tn[i] : 0;
     }
     mv(a[A], delta, n, n, tau_guard);
-    bounded(tau_guard, load, a[TAU_MAX], s[SHARE], n);
-    for (int i = 0; i < n; i++) out[6 + n + i] = sum[i] + load[i] + tau_guard[i];
+    double share = 1;
+    for (int i = 0; i < n; i++) {
+        double ahead = tau_guard[i] > 0 ? sum[i] + load[i] : -sum[i] - load[i], top = a[TAU_MAX][i];
+        double room = std::max(top - ahead, s[SHARE] * top);
+        if (std::fabs(tau_guard[i]) * share > room) share = room / std::fabs(tau_guard[i]);
+    }
+    for (int i = 0; i < n; i++) out[6 + n + i] = sum[i] + load[i] + share * tau_guard[i];
 }
 
 }  // namespace

@@ -128,6 +128,22 @@ def bounded(tau: F64, load: F64, tau_max: F64) -> F64:
 
 
 @njit(cache=True, fastmath=False)
+def opposed(tau: F64, others: F64, tau_max: F64) -> F64:
+    """Return tau (n,) [Nm] scaled as one to what every joint has left in its direction beside all others (n,).
+
+    Braking that opposes a field may use the field's torque as well as the motor's: measured against the load alone, as
+    `bounded` does, it could stop a field that pushes at its bound but not what the field has set in motion.
+    """
+    scale = 1.0
+    for i in range(tau.shape[0]):
+        ahead = others[i] if tau[i] > 0.0 else -others[i]
+        room = max(tau_max[i] - ahead, LEAST_SHARE * tau_max[i])
+        if abs(tau[i]) * scale > room:
+            scale = room / abs(tau[i])
+    return tau * scale
+
+
+@njit(cache=True, fastmath=False)
 def diagonal(A: F64) -> F64:
     """Return the diagonal (n,) of a matrix (n, n)."""
     out = np.empty(A.shape[0])
@@ -251,9 +267,10 @@ def _evaluate(
     tau_limits = bounded(tau_limits, load, tau_max)
     drive, keep = tau_drive + tau_rest, tau_brake + tau_damp + tau_obstacles + tau_limits
     tau_tip, hasty = tip_guard(model.J, model.Jdqd, model.A_inv, drive + keep, xd, p.v_max, p.epsilon)
-    keep = keep + bounded(tau_tip, load, tau_max)
+    tau_tip = bounded(tau_tip, load, tau_max)
+    keep = keep + tau_tip
     tau_guard, fast = guard(model.A, model.A_inv, drive + keep, q, qd, q_min, q_max, qd_max, braking)
-    tau_guard = bounded(tau_guard, load, tau_max)
+    tau_guard = opposed(tau_guard, load + drive + keep, tau_max)
     cut = _CAP if (flags | own_flags) & CAPPED else 0
     cut |= _SPEED if fast or hasty else 0
     cut |= _SINGULAR if space.damped else 0
