@@ -134,15 +134,18 @@ class Goal(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """An obstacle as it is described: a named, posed, possibly moving primitive."""
+    """An obstacle as it is described: a named, posed, possibly moving primitive, mesh or cloud of points."""
 
     name: str
-    type: str  # sphere | capsule | segment | point | box | plane | ellipsoid | n_ellipsoid | ...
+    type: str  # sphere | capsule | segment | point | box | plane | ellipsoid | n_ellipsoid | mesh | cloud | ...
     dims: F64  # (4,) meaning by type, see control.primitives
     position: F64  # (3,) [m] of the primitive's frame in the world
     wxyz: F64  # (4,) orientation
     velocity: F64  # (3,) [m/s]
     omega: F64  # (3,) [rad/s]
+    group: str = ""  # parts of one union: of them the nearest to a point acts on it; "" = adds to the others
+    mesh: str = ""  # of a mesh: the name of its solid among the robot's
+    cloud: bytes = b""  # of a cloud: x, y, z of each point in whole steps, little-endian int16
 
 
 class ObstacleEdit(NamedTuple):
@@ -151,6 +154,7 @@ class ObstacleEdit(NamedTuple):
     name: str
     shape: Shape | None
     age: float = 0.0
+    feed: bool = False  # somebody keeps observing it: the observation grows stale even of what rests
 
 
 class Request(NamedTuple):

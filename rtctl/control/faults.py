@@ -93,6 +93,7 @@ class SafetyParams(NamedTuple):
     limit_tolerance: float  # [rad] beyond a joint limit before it is a fault
     innovation_max: float  # [standard deviations]
     feed_timeout: float  # [s] of a moving obstacle's observation
+    creep: float = 0.1  # [m/s] speed that observed obstacles may have beside the one that is told
 
 
 class Evidence(NamedTuple):

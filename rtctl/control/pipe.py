@@ -78,7 +78,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     q, zero = feedback.q.copy(), np.zeros(robot.n)
     model = robot.body.evaluate(q, zero, robot.points, robot.own)
     joints, tip = joint_start(q, robot.joint_P), start(model.x, model.R, robot.tip_design)
-    table = world.with_static(world.empty(robot.slots), robot.obstacles)
+    table = world.empty(robot.slots, robot.meshes, robot.safety.creep, robot.safety.feed_timeout)
+    table = world.with_static(table, robot.obstacles)
     space = _space(robot, robot.axes, TOOL_Z, model)
     far = np.full(robot.slots, np.inf)
     return Memory(
@@ -148,7 +149,8 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
         robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
         m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
     )  # fmt: skip
-    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=law.rho), law
+    seen = law.rho + m.world.obstacles.margin  # where it is, not where it might be: no contact by growing old
+    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=seen), law
 
 
 def _pace(robot: Robot, m: Memory) -> float:
@@ -240,6 +242,11 @@ def _record(
     )  # fmt: skip
 
 
+def _meshes_at(robot: Robot, position: np.ndarray, wxyz: np.ndarray) -> list[Shape]:
+    names, zero = robot.meshes.names[:1], np.zeros(4)
+    return [Shape("mesh", "mesh", zero, position, wxyz, zero[:3], zero[:3], mesh=name) for name in names]
+
+
 def warm(robot: Robot) -> None:
     """Run the tick through every kind of work once, so that nothing is compiled or loaded while the arm moves."""
     n = robot.n
@@ -263,7 +270,10 @@ def warm(robot: Robot) -> None:
     edits = tuple(
         ObstacleEdit(kind, Shape(kind, kind, np.array([0.1, 0.1, 0.1, 2.0]), far, wxyz, np.ones(3), np.ones(3)))
         for kind in primitives.TYPES
+        if kind not in ("mesh", "cloud")
     )
+    many = Shape("cloud", "cloud", np.array([0.1, 1e-3, 0.0, 0.0]), far, wxyz, np.ones(3), np.ones(3), cloud=bytes(600))
+    edits += tuple(ObstacleEdit(s.name, s) for s in (many, *_meshes_at(robot, far, wxyz)))
     for task in (Task.POSE, Task.POSITION | Task.DIRECTION):
         goal = Goal(m.tip.x, quat_of(m.tip.R), task, 1e-3, 1e-2)
         moving = m._replace(state=State.RUN, goal=goal, in_force=0)

@@ -8,6 +8,7 @@ from rtctl.control.estimator import Design, EstimatorParams, JointParams
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import Field, FieldParams, LimitParams
 from rtctl.control.mobility import Mobility
+from rtctl.control.meshes import NONE, Meshes
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own
@@ -68,4 +69,5 @@ class Robot(NamedTuple):
     tolerance: float  # [m] of a goal that gives none
     tolerance_rot: float  # [rad]
     axes: Task = Task.POSE  # of the tip that the arm can move
+    meshes: Meshes = NONE  # that obstacles may refer to
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`
