@@ -45,6 +45,7 @@ class Settings(NamedTuple):
     """The robot file, as far as drives, plant and bus need it."""
 
     name: str
+    folder: Path  # of the file: its own paths are relative to it
     urdf: Path
     package_dirs: tuple[Path, ...]
     tip_frame: str
@@ -59,6 +60,7 @@ class Settings(NamedTuple):
     fd: bool
     e2e: bool
     obstacles: tuple[dict[str, Any], ...]
+    meshes: tuple[dict[str, Any], ...]
     socket: str | None
 
 
@@ -130,6 +132,7 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
     }
     return Settings(
         name=robot["name"],
+        folder=path.parent,
         urdf=resolve(robot["urdf"], path.parent, packages),
         package_dirs=packages,
         tip_frame=robot["tip_frame"],
@@ -153,6 +156,7 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
         fd=bool(link["fd"]),
         e2e=link["protocol"] == "mit+e2e",
         obstacles=tuple(file.get("obstacle", ())),
+        meshes=tuple(file.get("mesh", ())),
         socket=file.get("console", {}).get("socket"),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
+from rtctl.config.assets import load_assets
 from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
 from rtctl.control import faults, task
 from rtctl.control.robot import Robot
@@ -186,13 +187,14 @@ def _outside(robot: Robot, truth: Truth) -> bool:
     return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
 
 
-def open_simulator(config_path: Path, scenario: Scenario) -> Simulator:
-    """Return the installed simulator. Raises ConfigError when none is, RtctlError with what it refuses."""
+def open_simulator(config_path: Path, scenario: Scenario, path: str | Path) -> Simulator:
+    """Return the installed simulator, playing the scenario of the file `path`. Raises ConfigError when none is, RtctlError with what it refuses."""
     found = {e.name: e for e in entry_points(group="rtctl.simulator")}
     if "pybullet" not in found:
         raise ConfigError("entry point rtctl.simulator", sorted(found) or "none", "one named pybullet: pip install .")
     try:
-        simulator: Simulator = found["pybullet"].load()(str(config_path), scenario_dict(scenario), seed=scenario.seed)
+        play = scenario_dict(scenario, path)
+        simulator: Simulator = found["pybullet"].load()(str(config_path), play, seed=scenario.seed)
     except RtctlError:
         raise
     except Exception as error:  # another program's refusal: its words, not its traceback
@@ -209,7 +211,8 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
     start = scenario.start_q_rad
     if start is not None and len(start) != robot.n:
         raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
-    simulator = open_simulator(where, scenario)
+    robot = robot._replace(meshes=load_assets((), scenario.obstacle, Path(path), robot.meshes).meshes)
+    simulator = open_simulator(where, scenario, path)
     link = CanLink(link_spec(config), InProcess.of(simulator))
     sink = None
     try:

@@ -16,6 +16,21 @@ VERBS = {
     "reset": "leave a latched stop or fault, once its cause is gone",
     "recover": "allow a slow move inward from beyond a joint limit",
 }
+KEYS_OF = {
+    "sphere": "radius_m",
+    "point": "",
+    "capsule": "radius_m length_m",
+    "segment": "length_m [radius_m]",
+    "cylinder": "radius_m length_m",
+    "cone": "radius_m height_m [top_radius_m]",
+    "box": "size_m=x,y,z",
+    "plane": "[normal=x,y,z]",
+    "ellipsoid": "semi_axes_m=a,b,c",
+    "n_ellipsoid": "semi_axes_m=a,b,c n",
+    "n_cylinder": "semi_axes_m=a,b,c n",
+    "mesh": "mesh=NAME",
+    "cloud": "file=FILE.npy|.xyz|.ply point_radius_m [voxel_m]",
+}
 WATCH_PERIOD = 0.1  # [s]
 EVERYTHING = "*"
 
@@ -73,8 +88,15 @@ def _add_obstacle(commands: Commands) -> None:
     example = "rtctl obstacle set crate box size_m=0.2,0.2,0.1 position_m=0.5,0,0.05"
     setter = command(actions, "set", "put an obstacle, or move it", example, _set)
     setter.add_argument("name", metavar="NAME")
-    setter.add_argument("type", metavar="TYPE", help="sphere, box, capsule, plane, ellipsoid, … as in a scenario")
+    setter.add_argument("type", metavar="TYPE", choices=KEYS_OF, help=", ".join(KEYS_OF))
     setter.add_argument("keys", metavar="KEY=VALUE", nargs="*", help="as in a scenario's [[obstacle]]; lists by commas")
+    setter.description = "Put an obstacle, or move it. Its type's own keys:\n\n" + "\n".join(
+        f"  {kind:12} {keys}" for kind, keys in KEYS_OF.items()
+    )
+    setter.description += (
+        "\n\nand of all: position_m, rpy_rad or wxyz, velocity_m_s, omega_rad_s, group, combine=union|sum.\n"
+        "A mesh is one that the daemon's config names in a [[mesh]]; a cloud's file is read here, thinned and sent."
+    )
     add_daemon(setter)
     clear = command(actions, "clear", "forget an obstacle", "rtctl obstacle clear --all", _clear)
     which = clear.add_mutually_exclusive_group(required=True)
@@ -102,7 +124,36 @@ def _set(arguments: argparse.Namespace) -> int:
     from rtctl.cli.values import assignments
 
     described = {"name": arguments.name, "type": arguments.type, **assignments(arguments.keys)}
+    if arguments.type == "cloud":
+        return _set_cloud(arguments, described)
     return _said(_demand(arguments, {"verb": "obstacle", "set": described}), f"obstacle {arguments.name}: set")
+
+
+def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
+    """Read the points here, where the file is, and send them as one binary message."""
+    from pathlib import Path
+
+    from rtctl.config.assets import load_cloud
+    from rtctl.config.obstacles import Cloud, quaternion
+    from rtctl.config.scenario import parse_obstacle
+    from rtctl.control.so3 import R_of
+    from rtctl.hal.client import Session, accepted
+    from rtctl.hal.messages import cloud_message
+
+    cloud = parse_obstacle(described, "obstacle")
+    assert isinstance(cloud, Cloud)
+    assert cloud.file is not None
+    points = load_cloud(Path(cloud.file), cloud.point_radius_m, cloud.voxel_m, "obstacle: file")
+    arm = R_of(quaternion(cloud.rpy_rad, cloud.wxyz)) @ points.centre  # the message's frame is at the points' centre
+    table = {k: v for k, v in described.items() if k not in ("file", "voxel_m")}
+    table |= {
+        "position_m": (arm + cloud.position_m).tolist(),
+        "velocity_m_s": (np.cross(cloud.omega_rad_s, arm) + cloud.velocity_m_s).tolist(),
+        "point_radius_m": points.radius,
+    }
+    with Session(daemon_of(arguments), arguments.reply) as session:
+        reply = accepted(session.ask_raw(cloud_message({"set": table, "step_m": points.step}, points.steps)))
+    return _said(reply, f"obstacle {arguments.name}: set, {points.count} points, radius {points.radius:.4g} m")
 
 
 def _clear(arguments: argparse.Namespace) -> int:

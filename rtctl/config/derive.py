@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.config import rules
+from rtctl.config.assets import Assets, load_assets, placed
 from rtctl.config.goal import task_of
-from rtctl.config.obstacles import quaternion, shape_of
+from rtctl.config.obstacles import Obstacle, quaternion, shape_of
 from rtctl.config.read import name_place
 from rtctl.config.structs import Config
 from rtctl.config.urdf import package_folders, urdf_file
@@ -52,8 +53,9 @@ def build(config: Config, path: str | Path) -> Robot:
     found = extremes(config, body)
     _refuse_torque(config, found, source)
     points, coverage, own = _geometry(config, body, home, source)
-    obstacles = tuple(shape_of(o) for o in config.obstacle)
-    _refuse_contact(obstacles, body, points, home, source)
+    assets = load_assets(config.mesh, config.obstacle, Path(path))
+    obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
+    _refuse_contact(obstacles, assets, body, points, home, source)
     rest = config.motion.posture.q_rest_rad
     tau_rated = np.array([j.tau_max_Nm for j in joints])
     robot = Robot(
@@ -81,6 +83,7 @@ def build(config: Config, path: str | Path) -> Robot:
         coverage=coverage,
         own=own,
         obstacles=obstacles,
+        meshes=assets.meshes,
         motion=_motion(config),
         avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
         self_avoid=_field(
@@ -196,11 +199,19 @@ def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[
     return points, coverage, own
 
 
-def _refuse_contact(obstacles: tuple[Shape, ...], body: RigidBody, points: Points, home: F64, source: str) -> None:
+def loaded_shape(obstacle: Obstacle, assets: Assets) -> Shape:
+    """Return the obstacle as the controller takes it, a cloud with its points."""
+    shape = shape_of(obstacle)
+    return placed(shape, assets.clouds[obstacle.name]) if obstacle.name in assets.clouds else shape
+
+
+def _refuse_contact(
+    obstacles: tuple[Shape, ...], assets: Assets, body: RigidBody, points: Points, home: F64, source: str
+) -> None:
     """Refuse an obstacle of the config that the arm touches at home."""
     P = body.evaluate(home, np.zeros(body.n), points).P
     for i, shape in enumerate(obstacles):
-        rho = distance(shape, P)[0] - points.radius
+        rho = distance(shape, P, assets.meshes)[0] - points.radius
         if rho.min() <= 0.0:
             place = name_place(source, f"obstacle[{i}].position_m")
             got = f"{shape.name} {-rho.min():.3g} m inside the points of {points.names[int(rho.argmin())]} at home"
@@ -291,6 +302,7 @@ def _safety(c: Config, tau_rated: F64) -> SafetyParams:
         limit_tolerance=s.limit_excess_rad,
         innovation_max=c.estimator.innovation_sigma,
         feed_timeout=s.obstacle_stale_s,
+        creep=c.avoid.obstacle_speed_m_s,
     )
 
 

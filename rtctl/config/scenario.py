@@ -102,9 +102,16 @@ def robot_file(scenario: Scenario, path: str | Path) -> Path:
     return found
 
 
-def scenario_dict(scenario: Scenario) -> dict[str, Any]:
-    """Return the scenario as the plain values of its TOML, defaults filled in and absent keys left out."""
-    return dict(_without_none(msgspec.to_builtins(scenario)))
+def scenario_dict(scenario: Scenario, path: str | Path = "scenario.toml") -> dict[str, Any]:
+    """Return the scenario as the plain values of its TOML, defaults filled in and absent keys left out.
+
+    Files of meshes and clouds, relative to `path`, become absolute.
+    """
+    plain = dict(_without_none(msgspec.to_builtins(scenario)))
+    for table in plain["obstacle"]:
+        if "file" in table:
+            table["file"] = str(Path(path).resolve().parent / table["file"])
+    return plain
 
 
 def _without_none(value: Any) -> Any:

@@ -142,6 +142,9 @@ class Avoid(Table, frozen=True, kw_only=True):
     joint_influence_rad: Annotated[float, Meta(ge=0.01, le=1.0, description="zone of the joint-limit potential")] = 0.2
     joint_clearance_rad: Annotated[float, Meta(ge=0.002, le=0.5)] = 0.03
     joint_braking_s: Annotated[float, Meta(ge=0.02, le=2.0, description="from qd_max to rest, before a limit")] = 0.2
+    obstacle_speed_m_s: Annotated[
+        float, Meta(ge=0.0, le=5.0, description="speed of obstacles beside the one told; times age it widens them")
+    ] = 0.1
     joint_speed_rad_s: Annotated[float, Meta(ge=0.05, le=50.0, description="spent at the joint clearance")] = 1.5
 
 
@@ -207,6 +210,17 @@ class DriveTable(Table, frozen=True, kw_only=True):
     t_max_Nm: Annotated[float, Meta(ge=0.01, le=5000.0)]
 
 
+class MeshTable(Table, frozen=True, kw_only=True):
+    """A solid that obstacles may refer to by name, those told to the running daemon included."""
+
+    name: Name
+    file: Annotated[Text, Meta(description="STL or OBJ, relative to this file")]
+    scale: Annotated[float, Meta(ge=1e-6, le=1e4, description="metres of a unit of the file")] = 1.0
+    hull: Annotated[bool, Meta(description="take the convex hull: for a surface that is open or crosses itself")] = (
+        False
+    )
+
+
 class Config(Table, frozen=True, kw_only=True):
     """One robot, one file."""
 
@@ -221,3 +235,4 @@ class Config(Table, frozen=True, kw_only=True):
     console: ConsoleTable = ConsoleTable()
     drives: Annotated[dict[Name, DriveTable], Meta(max_length=64)] = {}
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
+    mesh: Annotated[tuple[MeshTable, ...], Meta(max_length=32)] = ()

@@ -270,9 +270,7 @@ def _measure(
 
 
 @njit(cache=True, fastmath=False)
-def many(
-    P: F64, radius: F64, R: F64, p: F64, k: int, body: F64, o: int, grown: float, cutoff: float, out: F64
-) -> None:
+def many(P: F64, radius: F64, R: F64, p: F64, k: int, body: F64, o: int, grown: float, cutoff: float, out: F64) -> None:
     """Distances of points to the cloud or mesh at `body[o:]`, in slot k, whose items are `grown` [m] thick.
 
     As the kernels of `distance`, behind a pre-filter: the box about all is never farther than what is in it. The point

@@ -102,7 +102,9 @@ def _refuse_open(V: F64, T: I64) -> None:
     if np.any(there[1:] == there[:-1]):
         twice = there[1:][there[1:] == there[:-1]][0]
         place = np.array2string(V[twice // count], precision=4)
-        raise ValueError(f"a surface that is no surface: an edge at {place} runs twice the same way; hull = true wraps it")
+        raise ValueError(
+            f"a surface that is no surface: an edge at {place} runs twice the same way; hull = true wraps it"
+        )
     if not np.array_equal(there, back):
         lone = np.setdiff1d(there, back)
         place = np.array2string(V[lone[0] // count], precision=4)

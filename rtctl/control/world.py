@@ -97,9 +97,7 @@ def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
     shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
     moving[slot] = edit.feed or bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
     obstacles = with_shape(world.obstacles, slot, shape, known=world.known)
-    world = world._replace(
-        obstacles=obstacles, names=_at(world.names, slot, edit.name), age=age, moving=moving
-    )
+    world = world._replace(obstacles=obstacles, names=_at(world.names, slot, edit.name), age=age, moving=moving)
     return _with_margins(_joined(world, slot, shape.group))
 
 
@@ -119,9 +117,7 @@ def _joined(world: World, slot: int, union: str) -> World:
 def _without(world: World, slot: int) -> World:
     moving = world.moving.copy()
     moving[slot] = False
-    world = world._replace(
-        obstacles=without(world.obstacles, slot), names=_at(world.names, slot, ""), moving=moving
-    )
+    world = world._replace(obstacles=without(world.obstacles, slot), names=_at(world.names, slot, ""), moving=moving)
     return _joined(world, slot, "")
 
 
