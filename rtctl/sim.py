@@ -188,7 +188,10 @@ def _outside(robot: Robot, truth: Truth) -> bool:
 
 
 def open_simulator(config_path: Path, scenario: Scenario, path: str | Path) -> Simulator:
-    """Return the installed simulator, playing the scenario of the file `path`. Raises ConfigError when none is, RtctlError with what it refuses."""
+    """Return the installed simulator, playing the scenario of the file `path`.
+
+    Raises ConfigError when none is installed, RtctlError with what it refuses.
+    """
     found = {e.name: e for e in entry_points(group="rtctl.simulator")}
     if "pybullet" not in found:
         raise ConfigError("entry point rtctl.simulator", sorted(found) or "none", "one named pybullet: pip install .")

@@ -133,10 +133,9 @@ def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
     """Read the points here, where the file is, and send them as one binary message."""
     from pathlib import Path
 
-    from rtctl.config.assets import load_cloud
-    from rtctl.config.obstacles import Cloud, quaternion
+    from rtctl.config.assets import load_cloud, placed
+    from rtctl.config.obstacles import Cloud, shape_of
     from rtctl.config.scenario import parse_obstacle
-    from rtctl.control.so3 import R_of
     from rtctl.hal.client import Session, accepted
     from rtctl.hal.messages import cloud_message
 
@@ -144,16 +143,15 @@ def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
     assert isinstance(cloud, Cloud)
     assert cloud.file is not None
     points = load_cloud(Path(cloud.file), cloud.point_radius_m, cloud.voxel_m, "obstacle: file")
-    arm = R_of(quaternion(cloud.rpy_rad, cloud.wxyz)) @ points.centre  # the message's frame is at the points' centre
-    table = {k: v for k, v in described.items() if k not in ("file", "voxel_m")}
-    table |= {
-        "position_m": (arm + cloud.position_m).tolist(),
-        "velocity_m_s": (np.cross(cloud.omega_rad_s, arm) + cloud.velocity_m_s).tolist(),
+    shape = placed(shape_of(cloud), points)
+    table = {k: v for k, v in described.items() if k not in ("file", "voxel_m")} | {
+        "position_m": shape.position.tolist(),
+        "velocity_m_s": shape.velocity.tolist(),
         "point_radius_m": points.radius,
     }
     with Session(daemon_of(arguments), arguments.reply) as session:
         reply = accepted(session.ask_raw(cloud_message({"set": table, "step_m": points.step}, points.steps)))
-    return _said(reply, f"obstacle {arguments.name}: set, {points.count} points, radius {points.radius:.4g} m")
+    return _said(reply, f"obstacle {arguments.name}: set, {points.points} points of radius {points.radius:.4g} m")
 
 
 def _clear(arguments: argparse.Namespace) -> int:

@@ -31,7 +31,11 @@ class Packed(NamedTuple):
     step: float  # [m]
     centre: F64  # (3,) [m]
     radius: float  # [m] of the points, and what thinning and rounding may have moved them
-    count: int
+
+    @property
+    def points(self) -> int:
+        """Return how many there are."""
+        return len(self.steps) // 6
 
 
 class Assets(NamedTuple):
@@ -63,7 +67,7 @@ def packed(points: F64, radius: float, voxel: float = 0.0) -> Packed:
     steps = np.rint((few - centre) / step)
     moved = float(np.linalg.norm(points - (centre + step * steps)[index], axis=1).max())
     order = ordered(steps, POINTS_PER_LEAF)
-    return Packed(steps[order].astype("<i2").tobytes(), step, centre, radius + moved, len(few))
+    return Packed(steps[order].astype("<i2").tobytes(), step, centre, radius + moved)
 
 
 def _thinned(points: F64, voxel: float) -> tuple[F64, Any]:

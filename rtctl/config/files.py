@@ -5,6 +5,7 @@ Every reader raises ValueError, one line; OSError where the file cannot be read.
 
 import io
 import struct
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def _obj(raw: bytes) -> tuple[F64, I64]:
             face = [n - 1 if n > 0 else len(vertices) + n for n in numbers]
             if len(face) < 3 or 0 in numbers or min(face) < 0:
                 raise ValueError(f"line {at}: not a face")
-            triangles += [(face[0], b, c) for b, c in zip(face[1:], face[2:], strict=False)]
+            triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
     T = np.array(triangles, dtype=np.int64).reshape(-1, 3)
     if len(T) and T.max() >= len(vertices):
         raise ValueError(f"a face with vertex {T.max() + 1} of {len(vertices)}")

@@ -39,8 +39,8 @@ class Posed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
 
     At rest or at constant velocity: `position_m` is where it is at `appears_s`. Along `waypoints` ([t, x, y, z], t from
     the start of the scenario): straight lines between them, at rest before the first and after the last.
-    Obstacles of one `group` are one obstacle: of a union the part nearest to a point of the arm acts on that point; in a
-    sum, as among obstacles without a group, all do.
+    Obstacles of one `group` are one obstacle: of a union the part nearest to a point of the arm acts on that point; in
+    a sum, as among obstacles without a group, all do.
     """
 
     name: Name

@@ -82,7 +82,7 @@ def _hull(vertices: F64) -> tuple[F64, I64]:
 
 
 def _merged(vertices: F64, triangles: I64) -> tuple[F64, I64]:
-    """Return the mesh with equal vertices made one (an STL repeats them), without triangles that are edges or points."""
+    """Return the mesh with equal vertices made one (an STL repeats them), without triangles that are none."""
     V, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)
     T = index.reshape(-1)[triangles]
     whole = (T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2]) & (T[:, 2] != T[:, 0])
@@ -102,9 +102,7 @@ def _refuse_open(V: F64, T: I64) -> None:
     if np.any(there[1:] == there[:-1]):
         twice = there[1:][there[1:] == there[:-1]][0]
         place = np.array2string(V[twice // count], precision=4)
-        raise ValueError(
-            f"a surface that is no surface: an edge at {place} runs twice the same way; hull = true wraps it"
-        )
+        raise ValueError(f"a surface that folds: an edge at {place} runs twice the same way; hull = true wraps it")
     if not np.array_equal(there, back):
         lone = np.setdiff1d(there, back)
         place = np.array2string(V[lone[0] // count], precision=4)
@@ -137,7 +135,7 @@ def _normals(V: F64, T: I64) -> tuple[F64, F64, F64]:
 
 @njit(cache=True, fastmath=False)
 def winding(V: F64, T: I64, X: F64) -> F64:
-    """Return how often the surface winds about points X (m, 3): 1 inside, 0 outside (van Oosterom and Strackee 1983)."""
+    """Return how often the surface winds about points X (m, 3), 1 inside, 0 outside (van Oosterom, Strackee 1983)."""
     turns = np.zeros(X.shape[0])
     for i in range(X.shape[0]):
         x, y, z = X[i, 0], X[i, 1], X[i, 2]

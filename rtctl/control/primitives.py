@@ -296,8 +296,8 @@ def distances_into(P: F64, radius: F64, obstacles: Obstacles, cutoff: float, out
 
     P: (>= 3, m) [m], a row per coordinate. radius: (m,) [m]. cutoff: [m]; a distance below it, and the least of each
     obstacle, is exact; above it a lower bound may stand (not for the simple kinds). Infinite: all are exact.
-    out: (K, >= 4, m): row 0 rho [m], true distance to the surface minus radius and margin, negative inside, infinite for
-    inactive slots; rows 1-3 the unit normal d rho/d p, outward also inside, untouched for inactive slots.
+    out: (K, >= 4, m): row 0 rho [m], true distance to the surface minus radius and margin, negative inside, infinite
+    for inactive slots; rows 1-3 the unit normal d rho/d p, outward also inside, untouched for inactive slots.
     """
     R, p, dims = obstacles.R, obstacles.p, obstacles.dims
     for k in range(obstacles.active.shape[0]):

@@ -8,7 +8,7 @@ six bytes for each point, x, y, z in whole steps as int16. 10,000 points are 60 
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np

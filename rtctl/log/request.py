@@ -55,10 +55,10 @@ def _shape(shape: Shape) -> dict[str, Any]:
 
 
 def _shape_of(body: dict[str, Any]) -> Shape:
-    arrays = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
-    more = {"group": body.get("group", ""), "mesh": body.get("mesh", "")}
-    cloud = base64.b64decode(body.get("cloud", ""), validate=True)  # the wire's bytes: 60 kB at most
-    return Shape(name=body["name"], type=body["type"], **arrays, **more, cloud=cloud)
+    arrays = [np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")]
+    more = str(body.get("group", "")), str(body.get("mesh", ""))  # logs of before there were such have none
+    cloud = base64.b64decode(body.get("cloud", ""), validate=True)  # as on the wire: 60 kB at most
+    return Shape(body["name"], body["type"], *arrays, *more, cloud)
 
 
 def _goal(body: dict[str, Any]) -> Goal:
