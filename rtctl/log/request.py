@@ -55,10 +55,19 @@ def _shape(shape: Shape) -> dict[str, Any]:
 
 
 def _shape_of(body: dict[str, Any]) -> Shape:
-    arrays = [np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")]
-    more = str(body.get("group", "")), str(body.get("mesh", ""))  # logs of before there were such have none
-    cloud = base64.b64decode(body.get("cloud", ""), validate=True)  # as on the wire: 60 kB at most
-    return Shape(body["name"], body["type"], *arrays, *more, cloud)
+    numbers = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
+    return Shape(
+        body["name"],
+        body["type"],
+        numbers["dims"],
+        numbers["position"],
+        numbers["wxyz"],
+        numbers["velocity"],
+        numbers["omega"],
+        str(body.get("group", "")),  # logs of before there were such have none
+        str(body.get("mesh", "")),
+        base64.b64decode(body.get("cloud", ""), validate=True),  # as on the wire: 60 kB at most
+    )
 
 
 def _goal(body: dict[str, Any]) -> Goal:
