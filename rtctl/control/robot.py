@@ -7,8 +7,8 @@ import numpy as np
 from rtctl.control.estimator import Design, EstimatorParams, JointParams
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import Field, FieldParams, LimitParams
-from rtctl.control.mobility import Mobility
 from rtctl.control.meshes import NONE, Meshes
+from rtctl.control.mobility import Mobility
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own
