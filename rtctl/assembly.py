@@ -8,7 +8,7 @@ from rtctl.config import Config, scales
 from rtctl.config.urdf import urdf_file
 from rtctl.control.robot import Robot
 from rtctl.hal.can import JointSpec, LinkSpec
-from rtctl.log.header import Header, make_header
+from rtctl.log.header import Header, make_header, meshes_to_files
 from rtctl.types import F64
 
 
@@ -37,5 +37,6 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) ->
         robot.dt,
         config=path.read_text(encoding="utf-8"),
         urdf=urdf_file(config.robot.urdf, path).read_text(encoding="utf-8"),
+        files=meshes_to_files(robot.meshes),
         extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), **extra},
     )

@@ -3,6 +3,7 @@
 import json
 import platform
 import subprocess
+from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -11,10 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
 
 PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
 
+MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
 
 
@@ -66,6 +69,22 @@ def make_header(
         extra=dict(extra or {}),
         files=dict(files or {}),
     )
+
+
+def meshes_to_files(meshes: Meshes) -> dict[str, str]:
+    """Return the robot's solids as attachments, so that a log can be replayed without the files they came from."""
+    stops = [*meshes.starts[1:], len(meshes.data)]
+    parts = zip(meshes.names, meshes.starts, stops, strict=False)
+    return {MESH + name: b64encode(meshes.data[start:stop].tobytes()).decode() for name, start, stop in parts}
+
+
+def meshes_of(header: Header) -> Meshes:
+    """Return the solids that `meshes_to_files` attached, for the robot of a replay. Raises ValueError."""
+    meshes = NONE
+    for name, text in header.files.items():
+        if name.startswith(MESH):
+            meshes = added(meshes, name.removeprefix(MESH), np.frombuffer(b64decode(text, validate=True), np.float64))
+    return meshes
 
 
 def versions() -> dict[str, str]:
