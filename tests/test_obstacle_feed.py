@@ -44,6 +44,16 @@ def put(table: world.World, *shapes: Shape, age: float = 0.0, feed: bool = False
     return table
 
 
+def panda(folder: Path, **tables: list[dict[str, Any]]) -> Path:
+    """Write the Panda's file with tables of obstacles and meshes; return its path."""
+    text = changed(folder).read_text()
+    for name, rows in tables.items():
+        for row in rows:
+            text += f"\n[[{name}]]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in row.items())
+    (folder / "panda.toml").write_text(text)
+    return folder / "panda.toml"
+
+
 # ---- unions and sums
 
 
@@ -87,8 +97,8 @@ PART = '[[obstacle]]\nname = "{}"\ntype = "sphere"\nradius_m = 0.1\nposition_m =
 @pytest.mark.parametrize(
     ("second", "line"),
     [
-        ('group = "u"\ncombine = "sum"', "combine: got 'sum', wanted union, as the rest of group u"),
-        ('combine = "sum"', "combine: got 'sum', wanted a group beside it"),
+        ('group = "u"\ncombine = "sum"', "combine: got sum, wanted union, as the rest of group u"),
+        ('combine = "sum"', "combine: got sum, wanted a group beside it"),
         ('group = "u"\ncombine = "mean"', "combine: got 'mean', wanted one of"),
     ],
 )
@@ -130,9 +140,9 @@ def test_the_field_sees_the_margin_and_contact_does_not() -> None:
         arm.tick(Request(obstacles=(ObstacleEdit("ball", ball, age, True),)))
         seen.append(float(arm.record[0]["rho"][0]))
         assert "contact" not in arm.present
-    assert seen[0] - np.array(seen) == pytest.approx([0.0, 0.015, 0.03, 0.12], abs=1e-9)
+    assert seen[0] - np.array(seen) == pytest.approx([0.0, 0.015, 0.03, 0.12], abs=1e-5)
     assert seen[-1] < 0.0
-    assert arm.memory.rho[0] == pytest.approx(seen[0])
+    assert arm.memory.rho[0] == pytest.approx(seen[0], abs=1e-5)
 
 
 def test_what_a_camera_shows_must_be_shown_again_and_then_all_is_well() -> None:
@@ -279,7 +289,7 @@ def test_the_daemon_opens_no_file_that_a_peer_names(table: dict[str, Any], line:
 
 def test_a_mesh_is_told_by_the_name_that_the_config_gave_it(tmp_path: Path) -> None:
     write_stl(tmp_path / "it.stl", SURFACES["ell"])
-    path = changed(tmp_path, obstacle=[], mesh=[{"name": "ell", "file": "it.stl", "scale": 1.5}])
+    path = panda(tmp_path, mesh=[{"name": "ell", "file": "it.stl", "scale": 1.5}])
     arm = cfg.build(cfg.load(path), path)
     assert arm.meshes.names == ("ell",)
     told = messages.decode(json.dumps({"verb": "obstacle", "set": {
@@ -295,13 +305,13 @@ def test_a_mesh_is_told_by_the_name_that_the_config_gave_it(tmp_path: Path) -> N
     ("tables", "line"),
     [
         ({"mesh": [{"name": "a", "file": "no.stl"}]}, "mesh[0].file: got "),
-        ({"mesh": [{"name": "a", "file": "a.obj"}] * 2}, "mesh[1].name: got 'a', wanted a name not used before"),
+        ({"mesh": [{"name": "a", "file": "a.obj"}] * 2}, "mesh[1].name: got a, wanted a name not used before"),
         (
             {"obstacle": [{"type": "mesh", "mesh": "b"}]},
-            "obstacle[0].mesh: got 'b', wanted one of the config's [[mesh]]",
+            "obstacle[0].mesh: got b, wanted one of the config's [[mesh]]",
         ),
         ({"obstacle": [{"type": "mesh", "file": "b.obj"}]}, "obstacle[0].file: got "),
-        ({"obstacle": [{"type": "cloud", "point_radius_m": 0.1}]}, "obstacle[0].file: got 'nothing'"),
+        ({"obstacle": [{"type": "cloud", "point_radius_m": 0.1}]}, "obstacle[0].file: got nothing"),
         ({"obstacle": [{"type": "cloud", "point_radius_m": 0.1, "file": "b.npy"}]}, "obstacle[0].file: got "),
     ],
 )
@@ -311,7 +321,7 @@ def test_files_of_the_config_that_are_not_there_are_refused_by_a_line(
     write_obj(tmp_path / "a.obj", box(0.1, 0.1, 0.1))
     for i, table in enumerate(tables.get("obstacle", ())):
         table |= {"name": f"o{i}", "position_m": [2.0, 0.0, 0.0]}
-    path = changed(tmp_path, **tables)
+    path = panda(tmp_path, **tables)
     with pytest.raises(ConfigError) as caught:
         cfg.build(cfg.load(path), path)
     assert line in str(caught.value)
@@ -324,7 +334,12 @@ def test_the_command_line_reads_a_clouds_file_and_sends_its_points(
     points = np.random.default_rng(3).normal(size=(20_000, 3)) * 0.1
     np.save(tmp_path / "scan.npy", points)
     sent: list[bytes] = []
-    monkeypatch.setattr(client.Session, "ask_raw", lambda self, data: sent.append(data) or {"ok": True})
+
+    def taken(session: client.Session, data: bytes) -> dict[str, Any]:
+        sent.append(data)
+        return {"ok": True}
+
+    monkeypatch.setattr(client.Session, "ask_raw", taken)
     words = ["file=" + str(tmp_path / "scan.npy"), "point_radius_m=0.01", "position_m=1,0,0.5", "rpy_rad=0,0,1.5708"]
     assert main(["obstacle", "set", "bin", "cloud", *words, "--socket", console.path]) == 0
     assert "points of radius" in capsys.readouterr().out
@@ -447,7 +462,7 @@ def test_the_simulated_camera_sends_what_the_daemon_reads(tmp_path: Path) -> Non
     """Clouds as binary messages; a mesh by the config's name, one of a file of its own as the box that holds it."""
     write_stl(tmp_path / "ell.stl", SURFACES["ell"])
     np.save(tmp_path / "dust.npy", np.random.default_rng(6).normal(size=(500, 3)) * 0.05 + 0.2)
-    path = changed(tmp_path, mesh=[{"name": "ell", "file": "ell.stl"}])
+    path = panda(tmp_path, mesh=[{"name": "ell", "file": "ell.stl"}])
     specs = [
         {"name": "a", "type": "mesh", "mesh": "ell", "position_m": [1.0, 0.0, 0.5], "group": "g"},
         {"name": "b", "type": "mesh", "file": str(tmp_path / "ell.stl"), "position_m": [0.0, 1.0, 0.5]},
@@ -464,13 +479,13 @@ def test_the_simulated_camera_sends_what_the_daemon_reads(tmp_path: Path) -> Non
     for k in range(4):
         eye.tick(k * 20_000_000, 0)
     eye.close()
-    truth = {e.name: e.shape for e in simulator.obstacles()}
+    truth = {e.name: e.shape for e in simulator.obstacles() if e.shape is not None}
     simulator.close()
     heard = [messages.decode(raw) for raw in sent]
     assert sum(isinstance(m, messages.CloudFrame) for m in heard) == 2  # of four frames at 50 Hz, at 30 Hz
     edits = [e for m in heard for e in messages.request_of(m, BOUNDS, list).obstacles]
     assert all(e.feed for e in edits)
-    shapes = {e.name: e.shape for e in edits}
+    shapes = {e.name: e.shape for e in edits if e.shape is not None}
     assert (shapes["a"].type, shapes["a"].mesh, shapes["a"].group) == ("mesh", "ell", "g")
     assert shapes["b"].type == "box"
     assert shapes["b"].dims[:3] == pytest.approx(np.abs(SURFACES["ell"].V).max(axis=0), abs=1e-6)
