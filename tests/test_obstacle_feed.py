@@ -238,6 +238,21 @@ def test_one_cloud_at_a_time_goes_to_a_tick(console: Console) -> None:
     assert sizes == [1, 1, 1, 1, 0]
 
 
+def test_a_stamp_counts_the_time_that_the_message_took() -> None:
+    def told(**more: float) -> float:
+        ball = {"type": "sphere", "name": "ball", "radius_m": 0.1, "position_m": [0.5, 0.0, 0.4]}
+        message = messages.decode(json.dumps({"verb": "obstacles", "set": [ball], **more}).encode())
+        assert isinstance(message, messages.ObstaclesMessage)
+        return messages.notices_of(message, 100.0)[0].edit(0.002).age
+
+    assert told(stamp_s=99.75) == pytest.approx(0.252)
+    assert told(age_s=0.25) == pytest.approx(0.252)
+    assert messages.notices_of(messages.decode(cloud_of(1, stamp_s=99.5)), 100.0)[0].age == pytest.approx(0.5)
+    for more in ({"stamp_s": 100.001}, {"stamp_s": 80.0}, {"stamp_s": 99.9, "age_s": 0.1}):
+        with pytest.raises(RequestError, match="stamp_s: got"):
+            told(**more)
+
+
 @pytest.mark.parametrize(
     ("message", "line"),
     [

@@ -12,6 +12,7 @@ import select
 import socket
 import stat
 import struct
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -189,11 +190,11 @@ class Console:
             case messages.Status():
                 self._reply_raw(peer, self._status_reply())
             case messages.ObstaclesMessage() | messages.CloudFrame(header=messages.CloudMessage(feed=True)):
-                notices = messages.notices_of(message)
+                notices = messages.notices_of(message, time.monotonic())
                 self._queue(notices)
                 self._reply(peer, {"ok": True, "accepted": len(notices), "refused": self._camera_refusal})
             case _:
-                request = messages.request_of(message, self._bounds, self._orientation)
+                request = messages.request_of(message, self._bounds, self._orientation, time.monotonic())
                 for edit in request.obstacles:  # newer than what a camera said before
                     self._forget(edit.name)
                 self._held = _Held(peer, request)

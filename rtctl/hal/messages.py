@@ -34,7 +34,11 @@ OBSTACLES_MAX = 64  # in one camera frame
 CLOUD_MARK = b"RTCLOUD1"
 _LENGTH = struct.Struct("<I")
 
-Age = Annotated[float, Meta(ge=0.0, le=10.0)]
+AGE_MAX = 10.0  # [s]
+Age = Annotated[float, Meta(ge=0.0, le=AGE_MAX)]
+Stamp = Annotated[
+    float, Meta(ge=0.0, le=1e12, description="of the observation, CLOCK_MONOTONIC [s], in place of age_s")
+]
 NameOrAll = Annotated[str, Meta(max_length=32, pattern=r"^(\*|[A-Za-z0-9][A-Za-z0-9_.+-]*)$")]
 
 
@@ -86,6 +90,7 @@ class ObstacleMessage(_Message, tag="obstacle", frozen=True, kw_only=True):
     set: Obstacle | None = None
     clear: NameOrAll | None = None
     age_s: Age = 0.0
+    stamp_s: Stamp | None = None
 
 
 class ObstaclesMessage(_Message, tag="obstacles", frozen=True, kw_only=True):
@@ -97,6 +102,7 @@ class ObstaclesMessage(_Message, tag="obstacles", frozen=True, kw_only=True):
     set: Annotated[tuple[Obstacle, ...], Meta(max_length=OBSTACLES_MAX)]
     clear: Annotated[tuple[Name, ...], Meta(max_length=OBSTACLES_MAX)] = ()
     age_s: Age = 0.0
+    stamp_s: Stamp | None = None
 
 
 class CloudMessage(_Message, tag="cloud", frozen=True, kw_only=True):
@@ -106,6 +112,7 @@ class CloudMessage(_Message, tag="cloud", frozen=True, kw_only=True):
     step_m: Annotated[float, Meta(ge=1e-6, le=0.01)]
     feed: bool = False
     age_s: Age = 0.0
+    stamp_s: Stamp | None = None
 
 
 class CloudFrame(NamedTuple):
@@ -177,13 +184,18 @@ def _refuse(path: str, obstacle: Obstacle) -> None:
         raise RequestError(f"{path}.file: got {obstacle.file!r}, wanted mesh = the name of a [[mesh]] of the config")
 
 
-def request_of(message: Message | CloudFrame, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Request:
-    """Return what the tick gets; `orientation` says the tip's wxyz, for a goal that holds it. Raises RequestError."""
+def request_of(
+    message: Message | CloudFrame, bounds: Bounds, orientation: Callable[[], Sequence[float]], now: float = math.nan
+) -> Request:
+    """Return what the tick gets; `orientation` says the tip's wxyz, for a goal that holds it. Raises RequestError.
+
+    now: as in `notices_of`.
+    """
     match message:
         case GoalMessage():
             return Request(goal=_goal_of(message, bounds, orientation))
         case ObstacleMessage() | ObstaclesMessage() | CloudFrame():
-            return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message)))
+            return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message, now)))
         case Status():
             return Request()
         case _:
@@ -208,19 +220,34 @@ class Notice(NamedTuple):
         return ObstacleEdit(self.name, shape, self.age + waited, self.feed)
 
 
-def notices_of(message: ObstacleMessage | ObstaclesMessage | CloudFrame) -> list[Notice]:
-    """Return one notice per obstacle that is set or cleared; the name "*" clears all. Raises RequestError."""
+def notices_of(message: ObstacleMessage | ObstaclesMessage | CloudFrame, now: float = math.nan) -> list[Notice]:
+    """Return one notice per obstacle that is set or cleared; the name "*" clears all. Raises RequestError.
+
+    now: CLOCK_MONOTONIC [s], for observations that carry a stamp in place of an age.
+    """
     if isinstance(message, CloudFrame):
         header = message.header
-        return [Notice(header.set.name, header.set, header.age_s, header.feed, message.steps, header.step_m)]
+        return [Notice(header.set.name, header.set, _age(header, now), header.feed, message.steps, header.step_m)]
+    age = _age(message, now)
     if isinstance(message, ObstaclesMessage):
-        gone = [Notice(name, None, message.age_s) for name in message.clear]
-        return gone + [Notice(obstacle.name, obstacle, message.age_s, True) for obstacle in message.set]
+        gone = [Notice(name, None, age) for name in message.clear]
+        return gone + [Notice(obstacle.name, obstacle, age, True) for obstacle in message.set]
     if message.set is not None and message.clear is None:
-        return [Notice(message.set.name, message.set, message.age_s)]
+        return [Notice(message.set.name, message.set, age)]
     if message.clear is not None and message.set is None:
-        return [Notice(message.clear, None, message.age_s)]
+        return [Notice(message.clear, None, age)]
     raise RequestError("obstacle: got both or neither of set and clear, wanted one")
+
+
+def _age(message: ObstacleMessage | ObstaclesMessage | CloudMessage, now: float) -> float:
+    """Return how old an observation is [s], the time that its message took included where it carries a stamp."""
+    if message.stamp_s is None:
+        return message.age_s
+    age = now - message.stamp_s
+    if message.age_s != 0.0 or not 0.0 <= age <= AGE_MAX:
+        got = "an age beside it" if message.age_s != 0.0 else f"a time {age:.3f} s ago"
+        raise RequestError(f"stamp_s: got {got}, wanted CLOCK_MONOTONIC of the last {AGE_MAX:g} s alone")
+    return age
 
 
 def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Goal:
