@@ -22,6 +22,7 @@ KINDS = {
     "duplicate": "every reply comes twice",
     "corrupt_crc": "one bit of every reply is flipped",
     "corrupt_command": "one bit of every command is flipped",
+    "weak": "the drive gives half the torque it is told, and says nothing of it",
     "stuck_encoder": "the encoder repeats its last value",
     "encoder_jump": "the encoder is off by 0.5 rad",
     "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
@@ -132,5 +133,7 @@ class Injector:
                     drive.temperature = 125.0
                 elif f.kind == "hot":
                     drive.temperature = 110.0
+                elif f.kind == "weak":
+                    drive.strength = 0.5
                 elif f.kind == "reboot":
                     drive.boot()

@@ -34,7 +34,8 @@ from rtctl.hal.transport import open_transport
 from rtctl.servo import CAN_RX, CAN_TX, Servo, blocker_name
 from rtctl.types import Command, Drive, Link, State, Verb
 
-LOCKSTEP_WAIT = 0.1  # [s] for replies before a lockstep slot goes on without them
+LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
+LOCKSTEP_SILENT = 0.05  # [s] the same once a slot went without: a drive that fell silent need not be waited for
 REVIEW = 0.5  # [s] between looks at the recorder
 
 
@@ -149,7 +150,7 @@ def _loop(
 ) -> int:
     """Turn until the supervisor says that the daemon may leave; return the exit code."""
     every = max(1, round(REVIEW / servo.robot.dt))
-    told = 0
+    told, heard = 0, True
     for slot in slots:
         request = console.poll(slot.slot)
         if signals.take():
@@ -167,7 +168,7 @@ def _loop(
         if servo.memory.done:
             return EXIT_OK
         if lockstep:
-            servo.link.wait_replies(LOCKSTEP_WAIT)
+            heard = servo.link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
     raise AssertionError("the grid has no end")
 
 
@@ -200,7 +201,7 @@ def _fallback(servo: Servo, recorder: Recorder, slots: Iterator[Slot], lockstep:
         ).tau
         _send(servo.link, recorder, Command(Drive.TORQUE, sent))
         if lockstep:
-            servo.link.wait_replies(LOCKSTEP_WAIT)
+            servo.link.wait_replies(LOCKSTEP_SILENT)
 
 
 def _stop_frames(link: CanLink, robot: Robot, recorder: Recorder) -> None:
@@ -237,7 +238,7 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "status": m.status.name.lower(),
         "detail": blocker_name(robot, m),
         "tick": m.tick,
-        "time_s": m.tick * robot.dt,
+        "time_s": servo.now,
         "q_rad": m.joints.q,
         "x_m": m.tip.x,
         "wxyz": quat_of(m.tip.R),

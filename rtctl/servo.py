@@ -65,6 +65,7 @@ class Servo:
         self.memory: Memory = initial(robot, first_feedback(q))
         self.digest = hashlib.sha256()
         self.missed = 0
+        self.now = 0.0  # [s] robot time of the last slot
         self.faults_seen = 0
         self.compute = 0.0  # [s] of the previous turn
         self.events: list[tuple[float, str, str]] = []  # newest last; (time [s], name, detail)
@@ -85,7 +86,7 @@ class Servo:
         self.missed += slot.missed
         self.lateness = slot.lateness
         self.faults_seen |= self.memory.in_force
-        now = slot.slot * self.robot.dt
+        self.now = now = slot.slot * self.robot.dt
         news = _news(self.robot, before, self.memory, feedback)
         self.events += [(now, name, detail) for name, detail in news]
         self._log(feedback, record, frames, request, now, news)

@@ -92,6 +92,7 @@ class Link(IntFlag):
     SEQUENCE = 256  # a reply's counter jumped: frames were lost or overtook each other
     DISORDER = 512  # counters keep jumping
     LOG_DEGRADED = 1024  # set by the daemon: the log cannot be written
+    DERATED = 2048  # a drive says that it gives less torque than asked: hot, or at its own limit
 
 
 class Drive(IntEnum):

@@ -57,4 +57,5 @@ class Memory(NamedTuple):
     rho: F64  # (K,) [m] from the arm to each obstacle
     sent: F64  # (4, n) [Nm] the last commands, newest first
     cut: int  # types.Cut of the last tick
+    pulled: bool  # the last reference for the slew was taken from the echo: the drive does not give what it is sent
     pace: float  # fraction of qd_max that joints may have

@@ -11,7 +11,7 @@ from rtctl.control.estimator import joint_start, joint_step, start, tip_step, up
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
 from rtctl.control.law import Law, evaluate_law
-from rtctl.control.limits import Permitted, permit, slew_reference
+from rtctl.control.limits import Permitted, permit, pulled, slew_reference
 from rtctl.control.linalg import matvec
 from rtctl.control.memory import Memory
 from rtctl.control.model import Model
@@ -20,6 +20,7 @@ from rtctl.control.record import make_record
 from rtctl.control.robot import Robot
 from rtctl.control.session import (
     REST_HOLD,
+    believed,
     detected,
     drives_torque,
     held_here,
@@ -62,9 +63,10 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     """
     m = memory._replace(tick=memory.tick + 1, verdict="")
     elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
-    m = _estimated(robot, m, feedback, elapsed)
+    credible, jumped = believed(robot, m, feedback)
+    m = _estimated(robot, m, credible, elapsed)
     m = _perceived(robot, m, request, elapsed)
-    m, present = detected(robot, m, feedback)
+    m, present = detected(robot, m, credible, jumped)
     m = supervised(robot, m, feedback, request, present)
     m = with_goal(robot, m, request)
     m, law = _law(robot, m)
@@ -89,7 +91,7 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
         goal=None, hold=hold_at(model.x, model.R, robot.axes),
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
-        rho=far, sent=np.zeros((4, robot.n)), cut=0, pace=START_PACE,
+        rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,
     )  # fmt: skip
 
 
@@ -168,6 +170,7 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
         drive, keep = np.zeros(robot.n), m.model.g - robot.stop.damping * m.joints.qd * fresh
     lag = max(1, round(scan.largest(feedback.age) / robot.dt))
     reference = slew_reference(m.sent[0], feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, lag)
+    off = pulled(reference, m.sent[0], robot.tau_lsb)
     permitted = permit(drive, keep, m.joints.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt)
     command = Command(_asked_of_drives(m, feedback), permitted.tau)
     if command.drive != Drive.TORQUE:
@@ -175,7 +178,7 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
     moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
     qdd = matvec(m.model.A_inv, command.tau - m.model.h - m.model.g) if moving else np.zeros(robot.n)
     sent = scan.pushed(command.tau, m.sent)
-    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut), command, permitted
+    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut, pulled=off), command, permitted
 
 
 def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:

@@ -37,15 +37,37 @@ def drives_torque(m: Memory) -> bool:
     return m.state in (State.ARMED, State.RUN, State.STOPPING)
 
 
-def detected(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Memory, int]:
-    """Return the memory with the faults in force, and the bits of those present now."""
+def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, bool]:
+    """Return the feedback with silence in place of positions that no joint can have reached, and whether any is.
+
+    A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump.
+    """
+    if not drives_torque(m) or m.state == State.ARMED:
+        return feedback, False
+    elapsed = robot.dt * (1 + feedback.missed)
+    odd = faults.jumped(
+        feedback.q, feedback.age, feedback.replies, m.q_previous, m.age_previous, robot.qd_max, elapsed, robot.dt
+    )
+    if not scan.any_set(odd):
+        return feedback, False
+    silent = np.minimum(m.age_previous + elapsed, robot.safety.lost_periods * robot.dt)
+    return feedback._replace(
+        q=np.where(odd, m.q_previous, feedback.q),
+        age=np.where(odd, silent, feedback.age),
+        replies=np.where(odd, 0, feedback.replies),
+    ), True
+
+
+def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple[Memory, int]:
+    """Return the memory with the faults in force, and the bits of those present now; what jumped is in no feedback."""
     low, high = scan.span(m.sent)
     evidence = Evidence(
         active=drives_torque(m) and m.state != State.ARMED,
+        powered=drives_torque(m),
         torque_low=low,
         torque_high=high,
-        q_previous=m.q_previous,
-        age_previous=m.age_previous,
+        jumped=jumped,
+        pulled=m.pulled,
         armed_outside=m.recovering,
         not_finite=bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation),
         contact=scan.any_below(m.rho, 0.0),
