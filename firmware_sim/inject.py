@@ -24,6 +24,7 @@ KINDS = {
     "corrupt_command": "one bit of every command is flipped",
     "weak": "the drive gives half the torque it is told, and says nothing of it",
     "stuck_encoder": "the encoder repeats its last value",
+    "false_velocity": "the encoder's speed reads 1 rad/s too high",
     "encoder_jump": "the encoder is off by 0.5 rad",
     "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
 }
@@ -116,6 +117,8 @@ class Injector:
         if self.active("stuck_encoder", now, joint):
             return self.stuck.setdefault(joint, (q, qd))
         self.stuck.pop(joint, None)
+        if self.active("false_velocity", now, joint):
+            return q, qd + 1.0
         return (q + JUMP, qd) if self.active("encoder_jump", now, joint) else (q, qd)
 
     def apply(self, now: int, drives: Sequence[Drive]) -> None:

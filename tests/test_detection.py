@@ -15,7 +15,7 @@ WARNED = Link.DERATED
 
 
 def broken(inject: str, seconds: float, reach: list[float] | None = None) -> tuple[set[str], float, list[Turn], F64]:
-    """Return the faults, when [s] after the injection at 1 s the arm left RUN (-1: never), all turns and qd at the end."""
+    """Return the faults, when [s] after 1 s the arm left RUN (-1: never), all turns and qd at the end."""
     with lab(inject=(inject,) if inject else ()) as here:
         here.running()
         here.ask([0.5, 0.3, 0.5] if reach is None else reach, DOWN)
@@ -103,3 +103,16 @@ def test_recovering_from_beyond_a_limit_is_slow_whatever_pushes():
                 raise AssertionError("still beyond the limit")
             assert here.memory.state == State.RUN
         assert 0.02 < fastest < 0.12
+
+
+@pytest.mark.parametrize("joint", [0, 1, 3, 5])
+def test_an_encoder_that_sticks_while_its_joint_moves_stops_the_arm(joint: int):
+    seen, after, _, _ = broken(f"stuck_encoder@1.0:{joint}", 0.15)
+    assert seen & {"encoder_stuck", "innovation"}
+    assert 0.0 < after < 0.1
+
+
+def test_an_encoder_whose_speed_is_wrong_stops_the_arm():
+    seen, after, _, _ = broken("false_velocity@1.0:3", 0.1)
+    assert "velocity_mismatch" in seen
+    assert 0.0 < after < 0.05

@@ -32,7 +32,9 @@ DEMANDED = {
     "drive_fault": (Severity.SS1, "R"),
     "drive_disabled": (Severity.SS1, "R"),
     "torque_mismatch": (Severity.SS1, "R"),
+    "encoder_stuck": (Severity.SS1, "R"),
     "encoder_jump": (Severity.SS1, "R"),
+    "velocity_mismatch": (Severity.SS1, "R"),
     "not_finite": (Severity.SS1, "L"),
     "deadline": (Severity.SS2, "R"),
     "goal_in_obstacle": (Severity.SS2, "A"),
@@ -132,6 +134,8 @@ CASES = {
         said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 5), said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 4)
     ),
     "torque_mismatch": Case(off_torque(3.0, 6), off_torque(0.5, 20)),
+    "encoder_stuck": Case(said(*[{"qd": joint(2, 0.5)}] * 25), said(*[{"qd": joint(2, 0.04)}] * 150)),
+    "velocity_mismatch": Case(said(*[{"qd": joint(2, 1.5)}] * 25), said(*[{"qd": joint(2, 0.1)}] * 40)),
     "encoder_jump": Case(jumps(0.3, 0.3), jumps(0.003, 0.0, 0.3, 0.0, 0.003, 0.0)),
     "not_finite": Case(said({"qd": joint(3, np.nan)})),
     "deadline": Case(said(*[{"missed": 1}] * 3), said({"missed": 1}, {"missed": 1}, {}, {"missed": 9})),

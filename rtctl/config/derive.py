@@ -25,10 +25,13 @@ from rtctl.control.points import Coverage, Points
 from rtctl.control.primitives import distance
 from rtctl.control.robot import SLOTS, Robot, StopParams
 from rtctl.control.so3 import R_of
+from rtctl.control.watch import SHARE
 from rtctl.errors import ConfigError
 from rtctl.types import F64, Shape
 
 POSTURES = 256  # sampled for torque and inertia extremes
+FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
+VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
 P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
 
 
@@ -298,12 +301,25 @@ def _safety(c: Config, tau_rated: F64) -> SafetyParams:
         stale_periods=int(s.stale_hold_ms / period + 1e-9),
         lost_periods=int(s.stale_stop_ms / period + 1e-9),
         torque_tolerance=s.torque_error_ratio * tau_rated,
+        friction=FRICTION * s.torque_error_ratio * tau_rated,
+        velocity_tolerance=_velocity_tolerance(c),
         speed_tolerance=s.speed_ratio,
         limit_tolerance=s.limit_excess_rad,
         innovation_max=c.estimator.innovation_sigma,
         feed_timeout=s.obstacle_stale_s,
         creep=c.avoid.obstacle_speed_m_s,
     )
+
+
+def _velocity_tolerance(c: Config) -> F64:
+    """Return the bound (n,) [rad/s] of positions against speed: a share of qd_max, and what rounding leaves."""
+    if not c.estimator.joint_velocity:
+        return np.full(len(c.robot.joints), np.finfo(np.float64).max)  # they report no speed worth comparing
+    step = np.array([2.0 * s.p_max / (2**P_BITS - 1) for s in rules.scales(c)])
+    noise = np.hypot(step, c.estimator.position_noise_rad) * c.loop.servo_hz
+    qd_max = np.array([j.qd_max_rad_s for j in c.robot.joints])
+    bound: F64 = VELOCITY_SHARE * qd_max + 2.0 * SHARE * noise
+    return bound
 
 
 def _no_points() -> Points:

@@ -50,7 +50,9 @@ FAULTS = (
     Fault("drive_fault", 15, Severity.SS1, "R", "a drive reports a fault"),
     Fault("drive_disabled", 17, Severity.SS1, "R", "a drive left the enabled state by itself"),
     Fault("torque_mismatch", 18, Severity.SS1, "R", "a drive's torque is not the one it was sent"),
+    Fault("encoder_stuck", 19, Severity.SS1, "R", "a position stands still though the joint must move"),
     Fault("encoder_jump", 20, Severity.SS1, "R", "a position jumped twice by more than the joint can move"),
+    Fault("velocity_mismatch", 21, Severity.SS1, "R", "a joint's speed is not that of its positions"),
     Fault("not_finite", 25, Severity.SS1, "L", "a state or torque was not finite"),
     Fault("deadline", 30, Severity.SS2, "R", "3 slots running, or 10 periods, were missed"),
     Fault("goal_in_obstacle", 43, Severity.SS2, "A", "the goal lies inside an obstacle"),
@@ -93,6 +95,8 @@ class SafetyParams(NamedTuple):
     stale_periods: int  # SS2 beyond it
     lost_periods: int  # SS1 beyond it
     torque_tolerance: F64  # (n,) [Nm] of sent against echoed torque
+    friction: F64  # (n,) [Nm] that may hold a joint against the model
+    velocity_tolerance: F64  # (n,) [rad/s] of the filtered difference of speeds
     speed_tolerance: float  # overspeed beyond this fraction of qd_max
     limit_tolerance: float  # [rad] beyond a joint limit before it is a fault
     innovation_max: float  # [standard deviations]
@@ -108,6 +112,8 @@ class Evidence(NamedTuple):
     torque_low: F64  # (n,) [Nm] smallest of the torques the echo may answer to
     torque_high: F64  # (n,) [Nm] largest of them
     jumped: bool  # a joint's position was dropped: further than it can have moved
+    stuck: bool  # an encoder repeats itself; see `watch`
+    disagree: bool  # a joint's positions and speed disagree
     pulled: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
@@ -200,6 +206,8 @@ def detect(
         "drive_fault": seen & _FAULT,
         "drive_disabled": n.disabled >= 5,
         "torque_mismatch": n.mismatch >= 5 or n.pulled >= 5,
+        "encoder_stuck": e.stuck,
+        "velocity_mismatch": e.disagree,
         "encoder_jump": n.jumps.bit_count() >= 2,
         "not_finite": e.not_finite or seen & _NOT_FINITE,
         "deadline": e.powered and (n.missed >= 3 or f.missed >= 10),

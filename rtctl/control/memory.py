@@ -6,6 +6,7 @@ from rtctl.control.estimator import JointEstimate, TipEstimate
 from rtctl.control.faults import Counters
 from rtctl.control.model import Model
 from rtctl.control.osc import OperationalSpace
+from rtctl.control.watch import Watch
 from rtctl.control.world import World
 from rtctl.types import F64, I64, Goal, Severity, State, Status, Task
 
@@ -41,6 +42,7 @@ class Memory(NamedTuple):
     qdd: F64  # (n,) [rad/s2] predicted from the torque of the last command
     q_previous: F64  # (n,) [rad] of the last feedback
     age_previous: F64  # (n,) [s] how old it was
+    watch: Watch  # on the encoders
     rest: int  # ticks all joints have been at rest
     # task
     goal: Goal | None

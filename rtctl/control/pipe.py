@@ -6,7 +6,7 @@ block diagram is `tick`; each block is a function below it or a module beside it
 
 import numpy as np
 
-from rtctl.control import goals, primitives, scan, world
+from rtctl.control import goals, primitives, scan, watch, world
 from rtctl.control.estimator import joint_start, joint_step, start, tip_step, update_pose
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
@@ -88,7 +88,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         tick=-1, state=State.IDLE, since=-1, reaction=Severity.NONE, off=False, in_force=0,
         good=np.full(len(FAULTS), 1 << 30), counters=Counters(), clear_until=-1, recovering=False, outside=False,
         leaving=False, done=False, verdict="", joints=joints, tip=tip, innovation=0.0, model=model, space=space,
-        task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
+        task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero,
+        watch=watch.fresh(robot.n), rest=0,
         goal=None, hold=hold_at(model.x, model.R, robot.axes),
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
         rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rtctl.control import faults, goals, mobility, scan, supervisor, task, world
+from rtctl.control import faults, goals, mobility, scan, supervisor, task, watch, world
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
@@ -58,15 +58,28 @@ def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, boo
     ), True
 
 
+def _watched(robot: Robot, m: Memory, feedback: Feedback) -> tuple[watch.Watch, bool, bool]:
+    f, safety = feedback, robot.safety
+    elapsed = robot.dt * (1 + f.missed)
+    return watch.watched(
+        m.watch, f.q, f.qd, f.age, f.replies, m.q_previous, m.age_previous, m.qdd, m.model.A, safety.friction,
+        safety.velocity_tolerance, elapsed, robot.dt,
+    )  # fmt: skip
+
+
 def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple[Memory, int]:
     """Return the memory with the faults in force, and the bits of those present now; what jumped is in no feedback."""
     low, high = scan.span(m.sent)
+    active = drives_torque(m) and m.state != State.ARMED
+    seen, stuck, disagree = _watched(robot, m, feedback) if active else (watch.fresh(robot.n), False, False)
     evidence = Evidence(
-        active=drives_torque(m) and m.state != State.ARMED,
+        active=active,
         powered=drives_torque(m),
         torque_low=low,
         torque_high=high,
         jumped=jumped,
+        stuck=stuck,
+        disagree=disagree,
         pulled=m.pulled,
         armed_outside=m.recovering,
         not_finite=bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation),
@@ -88,6 +101,7 @@ def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple
         age_previous=feedback.age,
         outside=outside,
         recovering=m.recovering and outside,
+        watch=seen,
         rest=0 if scan.any_faster(feedback.qd, REST_SPEED) else m.rest + 1,
     )
     return m, present
