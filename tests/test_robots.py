@@ -1,6 +1,5 @@
 """The robots that come with the program: their descriptions against published numbers, their dynamics, their runs."""
 
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,14 @@ from firmware_sim.plant import Plant
 from firmware_sim.settings import load as load_settings
 from rtctl import config as cfg
 from rtctl.config.report import report
+from rtctl.control.mobility import mobility
 from rtctl.control.osc import operational_space
 from rtctl.control.robot import Robot
-from rtctl.types import F64, State, Status
+from rtctl.control.task import selection
+from rtctl.errors import ConfigError
+from rtctl.types import F64, TOOL_Z, State, Status, Task
 from tests.arms import NO_POINTS
-from tests.lab import ROOT, Run, play, robot
+from tests.lab import ROOT, play, robot
 
 NAMES = ("planar4", "puma560", "ur5", "openarm")
 # a, d, alpha, mass, centre of mass and diagonal of the inertia in DH frame i (Corke and Armstrong-Helouvry 1994)
@@ -230,35 +232,33 @@ def put_speed(plant: Plant, q: F64, qd: F64) -> None:
 # ---- what an arm can never do
 
 
-def test_an_arm_in_a_plane_is_singular_where_its_plane_says_so():
+def test_an_arm_in_a_plane_lacks_one_direction_and_two_turns_and_the_others_nothing():
+    for name in NAMES:
+        r = arm(name)
+        never = mobility(r.body, r.q_min, r.q_max)
+        plane = name == "planar4"
+        np.testing.assert_allclose(never.still.T @ never.still, np.diag([0, 0, plane]), atol=1e-12)
+        np.testing.assert_allclose(never.unturned.T @ never.unturned, np.diag([plane, plane, 0]), atol=1e-12)
+
+
+def test_an_arm_in_a_plane_is_singular_where_it_is_stretched_and_not_where_it_is_bent():
     r = arm("planar4")
-    assert [int(r.mobility.rank[mask]) for mask in (0b111, 0b111111, 0b100011, 0b000100)] == [2, 3, 3, 0]
-    for name in ("puma560", "ur5", "openarm"):
-        assert arm(name).mobility.rank[0b111111] == 6
-    for q, singular in ((r.home, False), (np.zeros(4), True)):  # stretched, it cannot move along itself
+    for q, singular in ((r.home, False), (np.zeros(4), True)):
         m = model_at("planar4", q)
-        space = operational_space(m.J, m.A_inv, m.Lambda_inv, 3, r.motion, int(r.mobility.rank[0b111]))
+        S = selection(int(Task.POSITION & r.axes), TOOL_Z, m.R)
+        space = operational_space(m.J, m.A_inv, m.Lambda_inv, S, r.motion)
         assert space.damped is singular
         in_plane = np.linalg.eigvalsh(m.J[:2] @ np.linalg.inv(m.A) @ m.J[:2].T)
         assert space.sigma_min == pytest.approx(in_plane[0], abs=1e-12)
 
 
-@cache
-def out_of_plane() -> Run:
-    goals = [
-        {"at_s": 0.3, "position_m": [0.9, 0.9, 0.1]},
-        {"at_s": 0.35, "position_m": [0.9, 0.9, 0.0], "rpy_rad": [0.5, 0.0, 1.8]},
-        {"at_s": 0.4, "position_m": [0.95, 0.9, 0.0], "rpy_rad": [0.0, 0.0, 1.7]},
-    ]
-    return play({"duration_s": 1.6, "goal": goals}, config_of("planar4"))
-
-
-def test_goals_out_of_the_plane_are_refused_with_the_direction_and_those_in_it_reached():
-    said = [detail for _, kind, detail in out_of_plane().events if kind == "rejected"]
-    assert len(said) == 2
-    assert "0.1 m along (0 0 1)" in said[0]
-    assert "which this arm never makes" in said[1]
-    assert [kind for _, kind, _ in out_of_plane().events][-1] == "arrived"
+def test_an_axis_along_which_the_arm_never_moves_is_refused(tmp_path: Path):
+    text = config_of("planar4").read_text().replace('"planar4.urdf"', f'"{config_of("planar4").parent}/planar4.urdf"')
+    for axes, i in ('["x", "y", "z"]', 2), ('["rx", "x", "y"]', 0):
+        path = tmp_path / "planar4.toml"
+        path.write_text(text.replace('["x", "y", "rz"]', axes))
+        with pytest.raises(ConfigError, match=rf"motion.axes\[{i}\]"):
+            cfg.build(cfg.load(path), path)
 
 
 # ---- runs

@@ -17,7 +17,7 @@ from rtctl.control.estimator import JointParams, design, design_joint, tip_param
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
 from rtctl.control.law import prepared
-from rtctl.control.mobility import Mobility, mobility
+from rtctl.control.mobility import mobility
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own, nothing, watched
@@ -55,6 +55,7 @@ def build(config: Config, path: str | Path) -> Robot:
     home = np.array(config.robot.home_rad)
     found = extremes(config, body)
     _refuse_torque(config, found, source)
+    _refuse_axes(config, body, source)
     points, coverage, own = _geometry(config, body, home, source)
     assets = load_assets(config.mesh, config.obstacle, Path(path))
     obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
@@ -80,7 +81,6 @@ def build(config: Config, path: str | Path) -> Robot:
         q_rest=home.copy() if rest is None else np.array(rest),
         base=np.array(config.robot.base_pose.position_m),
         reach=_reach(config, body),
-        mobility=_mobility(config, body, home),
         body=body,
         points=points,
         coverage=coverage,
@@ -234,9 +234,15 @@ def _reach(config: Config, body: RigidBody) -> float:
     return total
 
 
-def _mobility(c: Config, body: RigidBody, home: F64) -> Mobility:
+def _refuse_axes(c: Config, body: RigidBody, source: str) -> None:
+    """Raise ConfigError for an axis of the task along or about which the tip never moves."""
     q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
-    return mobility(body, q_min, q_max, home)
+    never = mobility(body, q_min, q_max)
+    for i, axis in enumerate(c.motion.axes):
+        lost = never.unturned if axis.startswith("r") else never.still
+        if np.linalg.norm(lost[:, "xyz".index(axis[-1])]) > 1.0 - 1e-6:
+            place = name_place(source, f"motion.axes[{i}]")
+            raise ConfigError(place, axis, "an axis along (x) or about (rx) which this arm can move")
 
 
 def _motion(c: Config) -> MotionParams:

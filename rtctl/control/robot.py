@@ -8,7 +8,6 @@ from rtctl.control.estimator import Design, EstimatorParams, JointParams
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import Field, FieldParams, LimitParams
 from rtctl.control.meshes import NONE, Meshes
-from rtctl.control.mobility import Mobility
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own
@@ -49,7 +48,6 @@ class Robot(NamedTuple):
     q_rest: F64  # (n,) [rad] of the posture task
     base: F64  # (3,) [m] base in the world
     reach: float  # [m] no point of the tip can be further from the base
-    mobility: Mobility  # where the tip can never go
     body: RigidBody  # evaluates the model; keeps scratch memory, no state
     points: Points
     coverage: Coverage

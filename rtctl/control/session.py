@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rtctl.control import faults, goals, mobility, scan, supervisor, task, watch, world
+from rtctl.control import faults, goals, scan, supervisor, task, watch, world
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
@@ -202,7 +202,6 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         verdict = f"goal: not possible in state {m.state.name}"
     elif m.outside:
         verdict = "goal: a joint is still beyond its limits"
-    verdict = verdict or mobility.refusal(goal, robot.mobility)
     wanted, why = task.within(goal.task, robot.axes)
     goal = goal._replace(task=wanted)
     rho = world.distance_from(m.world, task.point_of(goal, m.tip.x))
