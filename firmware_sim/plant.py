@@ -45,6 +45,9 @@ class Contact(NamedTuple):
     link: str
     other: str
     cause: str  # "arm" | "obstacle" | "self"
+    arm_m_s: float = 0.0  # speed with which the arm's own point came towards the obstacle, just before they met
+    other_m_s: float = 0.0  # and the obstacle's towards the arm
+    row: tuple[float, ...] = ()  # d gap/d q (n,) of the arm's point [m/rad]
 
 
 def rewrite(settings: Settings) -> str:
@@ -298,21 +301,25 @@ class Plant:
                     continue
                 pair = (self.links[point[3]], name)
                 if pair not in now and pair not in self.touching:
-                    self.contacts.append(Contact(self.time_ns / NS, *pair, self._cause(point, name)))
+                    self.contacts.append(self._met(point, name))
                 now.add(pair)
         self.touching = now | {pair for pair in self.touching if pair[1].startswith("self:")}
 
-    def _cause(self, point: tuple[Any, ...], name: str) -> str:
-        """Tell who closed the gap: the side whose surface moved faster along the normal before they met."""
+    def _met(self, point: tuple[Any, ...], name: str) -> Contact:
+        """Return the contact: whose surface moved faster along the normal before they met closed the gap."""
         q, qd = self._before  # the impact has changed the arm's speed already
         com, turned = pb.getLinkState(self.body, point[3], physicsClientId=self.client)[:2]
         local, _ = pb.multiplyTransforms(*pb.invertTransform(com, turned), point[5], (0.0, 0.0, 0.0, 1.0))
         rows = pb.calculateJacobian(self.body, point[3], local, q, qd, [0.0] * len(q), physicsClientId=self.client)
-        velocity = np.array(rows[0]) @ np.array(qd)
         normal = np.array(point[7])  # from the obstacle to the arm
+        row = normal @ np.array(rows[0])
+        own = -float(row @ np.array(qd))
         shape = shape_at(next(s for s in self.solids if s.name == name), self.scene_ns / NS)
-        own = 0.0 if shape is None else float(normal @ shape.velocity)
-        return "obstacle" if own > -float(normal @ velocity) else "arm"
+        other = 0.0
+        if shape is not None:
+            other = float(normal @ (shape.velocity + np.cross(shape.omega, np.array(point[6]) - shape.position)))
+        cause = "obstacle" if other > own else "arm"
+        return Contact(self.time_ns / NS, self.links[point[3]], name, cause, own, other, tuple(row.tolist()))
 
     def clearances(self) -> dict[str, float]:
         """Return the smallest distance of any moving link to each obstacle present [m], at most SIGHT."""
@@ -350,7 +357,7 @@ class Plant:
         distance = BEYOND if nearest is None else float(nearest[8]) - radius
         pair = (self.links[nearest[3]] if nearest is not None else "", name)
         if distance <= 0.0 and nearest is not None and least > 0.0 and pair not in self.touching:
-            self.contacts.append(Contact(self.time_ns / NS, *pair, self._cause(nearest, name)))
+            self.contacts.append(self._met(nearest, name))
         self.cloud_seen[name] = distance, min(least, distance), list(self.q), self.time_ns
         return min(distance, SIGHT)
 

@@ -334,7 +334,7 @@ def test_the_speed_limit_holds(monkeypatch: Patch):
         return k * e, k * e_rot
 
     monkeypatch.setattr(law, "velocity_reference", unlimited)
-    monkeypatch.setattr(law, "tip_guard", lambda *a: (np.zeros(7), False))
+    monkeypatch.setattr(law, "tip_row", lambda *a: (np.zeros(7), np.inf))
     assert not within_the_speed_limit()
 
 
