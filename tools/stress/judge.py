@@ -7,9 +7,8 @@ import numpy as np
 from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
 from rtctl.control.robot import Robot
-from rtctl.control.so3 import R_of, error
 from rtctl.servo import Servo
-from rtctl.types import F64, Task
+from rtctl.types import F64
 
 if TYPE_CHECKING:
     from tools.stress.play import Seen, Watch
@@ -89,7 +88,7 @@ def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
         ratio = abs(tau[i]) / robot.tau_max[i]
         return "" if ratio > 0.9 else f"saturated by {detail}, which has {ratio:.2f} of its torque"
     if status == "singular":
-        sigma = least_eigenvalue(robot, plant, 3 if m.goal.task == Task.POSITION else 6)
+        sigma = least_eigenvalue(robot, plant, [i for i in range(6) if int(m.goal.task) >> i & 1])
         bound = SINGULAR * robot.motion.epsilon
         return "" if sigma < bound else f"singular, with {sigma:.3g} of {robot.motion.epsilon:g}"
     return f"status {status} of an arm {watch.legs[-1].error:.3f} m short"
@@ -123,15 +122,12 @@ def goal_gap(plant: Plant, name: str, goal: F64) -> float:
     return min((float(p[8]) for p in points), default=np.inf)
 
 
-def least_eigenvalue(robot: Robot, plant: Plant, rows: int) -> float:
-    """Return the least eigenvalue [1/kg] of J A^-1 J^T, its angular rows scaled by the length, by pybullet."""
+def least_eigenvalue(robot: Robot, plant: Plant, rows: list[int]) -> float:
+    """Return the least eigenvalue [1/kg] of the rows of J A^-1 J^T, angular ones scaled by the length, by pybullet."""
     q, zero = plant.q, [0.0] * robot.n
     A = np.array(pb.calculateMassMatrix(plant.body, q, physicsClientId=plant.client)) + np.diag(plant.armature)
     state = pb.getLinkState(plant.body, plant.tip, computeForwardKinematics=1, physicsClientId=plant.client)
     at, _ = pb.multiplyTransforms(*pb.invertTransform(*state[:2]), state[4], (0.0, 0.0, 0.0, 1.0))
     J = np.vstack(pb.calculateJacobian(plant.body, plant.tip, at, q, zero, zero, physicsClientId=plant.client))
     J[3:] *= robot.motion.length
-    return float(np.linalg.eigvalsh(J[:rows] @ np.linalg.solve(A, J[:rows].T))[0])
-
-
-__all__ = ["R_of", "at_limit", "diagnosis", "error", "failures", "goal_gap", "least_eigenvalue"]
+    return float(np.linalg.eigvalsh(J[rows] @ np.linalg.solve(A, J[rows].T))[0])

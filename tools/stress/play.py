@@ -19,7 +19,7 @@ from rtctl.hal.clock import lockstep
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn
 from rtctl.sim import Feed, Tally, open_simulator
-from rtctl.types import F64, Drive, Severity, Status, Truth
+from rtctl.types import F64, Severity, Status, Truth
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 REST = 0.3  # [s] that an arm is watched at its goal when nothing moves any more
@@ -122,7 +122,7 @@ def play(table: dict[str, Any], index: int) -> Seen:
     name = table["robot"]
     robot, config = robot_of(name)
     scenario: Scenario = convert(table, Scenario, f"{name}:{index}")
-    simulator: Any = open_simulator(CONFIGS / f"{name}.toml", scenario)
+    simulator: Any = open_simulator(CONFIGS / f"{name}.toml", scenario, CONFIGS / "stress.toml")
     link = CanLink(link_spec(config), InProcess.of(simulator))
     try:
         servo = Servo(robot, link, None, link.handshake(listen=0.0, recover=True).q)
@@ -182,6 +182,3 @@ def _retreat(robot: Robot, plant: Plant, contact: Contact) -> tuple[float, float
     room = np.where(row > 0.0, robot.q_max - q, q - robot.q_min)
     free = np.minimum(robot.qd_max, np.sqrt(2.0 * robot.braking * np.maximum(room, 0.0)))
     return -contact.arm_m_s, float(np.abs(row) @ free)
-
-
-__all__ = ["Drive", "Seen", "play", "robot_of"]

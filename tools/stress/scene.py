@@ -21,7 +21,7 @@ from rtctl.config import Config
 from rtctl.config.obstacles import pose_at, shape_of
 from rtctl.config.read import convert
 from rtctl.config.scenario import Scenario
-from rtctl.control.primitives import TYPES, distance
+from rtctl.control.primitives import distance
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import quat_of
 from rtctl.types import F64
@@ -110,7 +110,7 @@ def _obstacle(robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: 
     at_start, at_end = _points(robot, start), _points(robot, end)
     _ROBOTS[robot.name] = robot
     for _ in range(TRIES):
-        kind = str(rng.choice(TYPES))
+        kind = str(rng.choice(KINDS))
         table: Table = {"name": name, "type": kind, **_SIZES[kind](rng, scale)}
         # somewhere the arm can be: about a point of it in a third configuration
         P = _points(robot, rng.uniform(robot.q_min, robot.q_max))
@@ -180,6 +180,9 @@ _SIZES: dict[str, Callable[[np.random.Generator, float], Table]] = {
     "n_ellipsoid": _triple("semi_axes_m", 0.02, 0.12, True),
     "n_cylinder": _triple("semi_axes_m", 0.02, 0.12, True),
 }
+
+
+KINDS = tuple(_SIZES)
 
 
 def toml_of(table: Table, comment: str) -> str:
