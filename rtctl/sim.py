@@ -5,6 +5,7 @@ from the simulator's account of the truth, which the controller never sees.
 """
 
 import time
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from rtctl.servo import Servo, Turn
 from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
+Watch = Callable[[Truth, Turn], None]  # is shown the truth after each period, and what the servo did in it
 ARM_TIME = 2.0  # [s] within which the robot must be running
 SHOWN = frozenset(("state", "fault"))  # events that are no statuses
 
@@ -205,7 +207,9 @@ def open_simulator(config_path: Path, scenario: Scenario, path: str | Path) -> S
     return simulator
 
 
-def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = False) -> dict[str, Any]:
+def simulate(
+    path: str | Path, log: str | Path | None = None, realtime: bool = False, watch: Watch | None = None
+) -> dict[str, Any]:
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
     scenario = load_scenario(path)
     where = robot_file(scenario, path)
@@ -226,7 +230,7 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
             sink = McapSink(Path(log), header_of(config, where, robot, greeting.q))
         servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
         tally = Tally(robot)
-        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime)
+        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime, watch)
         elapsed = time.perf_counter() - begun
     finally:
         if sink is not None:
@@ -244,7 +248,9 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
     }
 
 
-def _play(servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool) -> int:
+def _play(
+    servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool, watch: Watch | None
+) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
     feed = Feed(servo.robot, scenario, simulator, tally)
     dt, begun = servo.robot.dt, time.monotonic()
@@ -254,7 +260,10 @@ def _play(servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, 
         if truth.time >= scenario.duration_s or slot.slot * dt > scenario.duration_s + ARM_TIME:
             break
         turn = servo.turn(slot, feed.request(servo, truth))
-        tally.add(simulator.truth(), turn)
+        truth = simulator.truth()
+        tally.add(truth, turn)
+        if watch is not None:
+            watch(truth, turn)
         ticks += 1
         if realtime:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))
