@@ -3,7 +3,9 @@
 import argparse
 import json
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rtctl.cli.parser import Commands, command
 from rtctl.errors import EXIT_OK, UsageError
@@ -53,6 +55,10 @@ def _list(as_json: bool) -> int:
     return EXIT_OK
 
 
+def _moved(progress: Any, task: Any, part: float) -> None:
+    progress.update(task, completed=part)
+
+
 def _performed(names: list[str], folder: Path, quiet: bool) -> dict[str, object]:
     """Perform experiments one by one; progress goes to stderr, so that stdout is the answer alone."""
     from rich.console import Console
@@ -60,13 +66,14 @@ def _performed(names: list[str], folder: Path, quiet: bool) -> dict[str, object]
 
     from rtctl import experiment
 
-    console, figures = Console(stderr=True, highlight=False), {}
+    console = Console(stderr=True, highlight=False)
+    figures: dict[str, object] = {}
     columns = TextColumn("{task.description:<12}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         for name in names:
             task = progress.add_task(name, total=1.0)
             begun = time.perf_counter()
-            figures[name] = experiment.perform(name, folder, lambda part, t=task: progress.update(t, completed=part))
+            figures[name] = experiment.perform(name, folder, partial(_moved, progress, task))
             progress.remove_task(task)
             if not quiet:
                 took = time.perf_counter() - begun

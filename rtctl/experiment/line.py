@@ -1,4 +1,4 @@
-"""Straight lines under a speed limit: a Panda through the whole pipe, from goal to goal in free space (paper, eq. 8)."""
+"""Straight lines under a speed limit: a Panda through the whole pipe, from goal to goal in free space (eq. 8)."""
 
 from typing import Any, NamedTuple
 
@@ -84,7 +84,7 @@ def _analytic_rate(leg: Leg, omega: float) -> float:
 
 
 def analytic(leg: Leg, omega: float) -> tuple[F64, F64]:
-    """Return (t, e) of the critically damped unit mass from where the error is 20 mm on, with the speed it has there."""
+    """Return (t, e) of the critically damped unit mass from an error of 20 mm on, with its speed there."""
     k = int(np.argmax(leg.error < 0.020))
     t = leg.t[k:]
     e0, slope = leg.error[k], float(np.gradient(leg.error, leg.t)[k])

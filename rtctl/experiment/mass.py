@@ -44,7 +44,7 @@ def obstacles_of(*shapes: Shape) -> Obstacles:
 
 
 def motion_params(v_max: float, a_max: float, k_p: float) -> MotionParams:
-    """Return the gains of a critically damped unit mass without joints: speed [m/s], acceleration [m/s2], k_p [1/s2]."""
+    """Return the gains of a critically damped unit mass: speed [m/s], acceleration [m/s2], k_p [1/s2]."""
     k_v = 2.0 * float(np.sqrt(k_p))
     return MotionParams(k_p, k_v, v_max, a_max, 1.0, 1.0, 0.0, 1.0, np.ones(3), 0.0, 1.0, 1.0)
 
@@ -80,7 +80,7 @@ class Mass:
             X[k + 1] = X[k] + self.dt * V[k] + 0.5 * self.dt**2 * a
             V[k + 1] = V[k] + self.dt * a
         rho = distances(X, np.zeros(len(X)), self.obstacles)[0].min(axis=0)
-        return Flight(self.dt * np.arange(steps + 1), X, V, rho)
+        return Flight(np.arange(steps + 1, dtype=np.float64) * self.dt, X, V, rho)
 
     def _pull(self, x: F64, v: F64, goal: F64, p: MotionParams, v_ref: F64, w_ref: F64) -> tuple[F64, F64, F64]:
         """Return the slewed references and the force (3,) of the motion task: tau = J^T Lambda F*."""
@@ -96,7 +96,7 @@ class Mass:
 
 
 def potential(rho: F64, params: FieldParams) -> F64:
-    """Return U = eta/2 (1/rho - 1/rho0)^2 [m2/s2] of a unit mass, 0 beyond rho0 and infinite in contact (paper, eq. 17)."""
+    """Return U = eta/2 (1/rho - 1/rho0)^2 [m2/s2] of a unit mass, infinite in contact (eq. 17)."""
     with np.errstate(divide="ignore"):
         s = np.where(rho > 0.0, 1.0 / np.maximum(rho, 1e-300) - 1.0 / params.rho0, np.inf)
     return 0.5 * params.eta * np.maximum(s, 0.0) ** 2

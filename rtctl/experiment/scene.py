@@ -55,11 +55,13 @@ class Trace(NamedTuple):
 
     def least(self) -> F64:
         """Return the clearance (T,) [m] to the nearest obstacle, by pybullet."""
-        return np.min(list(self.clearance.values()), axis=0)
+        least: F64 = np.min(list(self.clearance.values()), axis=0)
+        return least
 
     def speed(self) -> F64:
         """Return the speed (T,) [m/s] of the tip."""
-        return np.linalg.norm(self.xd, axis=1)
+        speed: F64 = np.linalg.norm(self.xd, axis=1)
+        return speed
 
     def shapes(self, t: float) -> list[Shape]:
         """Return the obstacles that are there at time t [s], in their places."""

@@ -25,7 +25,7 @@ COLOURS = 200  # of a PNG
 CURVE = 1200  # points of a curve: more than a page shows
 Axes = Any
 
-RC = {
+RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 13.0,
     "axes.titlesize": 13.5,
