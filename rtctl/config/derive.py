@@ -94,6 +94,7 @@ def build(config: Config, path: str | Path) -> Robot:
         ),
         limit=_limit(config),
         **_filters(config, body, home),
+        carry=config.estimator.carry,
         safety=_safety(config, tau_rated),
         stop=StopParams(
             damping=config.safety.stop_damping * found.inertia_home,

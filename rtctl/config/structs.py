@@ -161,6 +161,9 @@ class Estimator(Table, frozen=True, kw_only=True):
     velocity_noise_rad_s: Annotated[float, Meta(ge=0.0, le=5.0, description="of a drive, beside its step")] = 0.0
     joint_velocity: Annotated[bool, Meta(description="the drives report a velocity worth using")] = True
     innovation_sigma: Annotated[float, Meta(ge=3.0, le=50.0)] = 8.0
+    carry: Annotated[
+        bool, Meta(description="tip and points between evaluations; false holds them still, to compare")
+    ] = True
 
 
 class Safety(Table, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ block diagram is `tick`; each block is a function below it or a module beside it
 import numpy as np
 
 from rtctl.control import goals, primitives, scan, watch, world
-from rtctl.control.estimator import joint_start, joint_step, start, tip_step, update_pose
+from rtctl.control.estimator import held, joint_start, joint_step, start, tip_step, update_pose
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
 from rtctl.control.law import Law, evaluate_law
@@ -115,7 +115,10 @@ def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> M
     space = _space(robot, task, axis, model) if due or changed else m.space
     tip, innovation = tip_step(m.tip, m.model.J, m.model.Jdqd, m.qdd, model.J, joints.qd, elapsed, robot.estimator)
     innovation = max(innovation, scan.largest(surprise))
-    if due:  # evaluated at the state of this slot: its age is zero
+    if not robot.carry:
+        tip = held(tip, model.x, model.R, model.J, joints.qd) if due else m.tip
+        model, innovation = model._replace(q=joints.q), scan.largest(surprise)  # the points have not moved either
+    elif due:  # evaluated at the state of this slot: its age is zero
         tip, other = update_pose(tip, model.x, model.R, 0.0, robot.estimator)
         innovation = max(innovation, other)
     return m._replace(

@@ -68,4 +68,5 @@ class Robot(NamedTuple):
     tolerance_rot: float  # [rad]
     axes: Task = Task.POSE  # of the tip that the arm can move
     meshes: Meshes = NONE  # that obstacles may refer to
+    carry: bool = True  # tip and points are estimated between evaluations; else held still
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`
