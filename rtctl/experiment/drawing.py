@@ -7,7 +7,7 @@ from matplotlib.patches import Polygon
 
 from rtctl.experiment.outline import Figurine, View, outline
 from rtctl.experiment.scene import Trace
-from rtctl.experiment.style import INK, PAPER, STONE, Axes, shade, thinned
+from rtctl.experiment.style import FAINT, INK, PAPER, PLINTH, STONE, Axes, shade, thinned
 from rtctl.types import F64, I64, Shape
 
 REACH = 4.0  # [m] to which a half space is drawn
@@ -44,7 +44,9 @@ def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: View, colour: tuple[f
              zorder: float, edge: str | tuple[float, float, float] = PAPER, lw: float = 0.7) -> None:  # fmt: skip
     """Draw the solids of an arm at q (n,), the nearest to the beholder last."""
     for piece in figurine.pieces(q, seen):
-        axes.add_patch(Polygon(piece.polygon, fc=colour, ec=edge, lw=lw, joinstyle="round", zorder=zorder))
+        still = piece.link == 0  # the base is the same in every frame
+        fc, ec = (PLINTH, FAINT) if still else (colour, edge)
+        axes.add_patch(Polygon(piece.polygon, fc=fc, ec=ec, lw=lw, joinstyle="round", zorder=4.0 if still else zorder))
 
 
 def draw_strobes(axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[int] | I64, seen: View,

@@ -17,7 +17,9 @@ from rtctl.types import F64
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE = (
     "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
-INK, FAINT, PAPER, STONE = "#222222", "#8C8C8C", "#FFFFFF", "#B9B2A6"
+INK, FAINT, PAPER, STONE, PLINTH, FRONT = (
+    "#222222", "#8C8C8C", "#FFFFFF", "#B9B2A6", "#E4E1DC", "#004475",
+)  # fmt: skip
 SERIES = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, INK)
 WIDTH, HEIGHT, DPI = 11.0, 6.6, 100  # [in], [in], [1/in]
 LIGHT, DARK = np.array([0.80, 0.88, 0.95]), np.array([0.0, 0.27, 0.46])
