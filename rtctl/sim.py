@@ -27,7 +27,7 @@ from rtctl.servo import Servo, Turn
 from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
-Watch = Callable[[Truth, Turn], None]  # is shown the truth after each period, and what the servo did in it
+Watch = Callable[[Servo, Truth, Turn], None]  # is shown the truth after each period, and what the servo did in it
 ARM_TIME = 2.0  # [s] within which the robot must be running
 SHOWN = frozenset(("state", "fault"))  # events that are no statuses
 
@@ -263,7 +263,7 @@ def _play(
         truth = simulator.truth()
         tally.add(truth, turn)
         if watch is not None:
-            watch(truth, turn)
+            watch(servo, truth, turn)
         ticks += 1
         if realtime:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))

@@ -12,7 +12,7 @@ from typing import Any
 
 from rtctl.errors import UsageError
 
-NAMES = ("potential", "line", "bounce")
+NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "rates", "bounce")
 DIGITS = 9  # of a number in a JSON file
 
 

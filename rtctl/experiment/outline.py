@@ -77,7 +77,10 @@ def _furthest(shape: Shape, u: F64) -> F64:
         case "n_cylinder":  # drawn with its edges
             w = u[:, :2] * d[:2]
             x = np.hstack([d[:2] * w / np.linalg.norm(w, axis=1, keepdims=True).clip(min=1e-12), side * d[2]])
-        case _:  # sphere, point
+        case "cloud":
+            points = d[1] * np.frombuffer(shape.cloud, "<i2").reshape(-1, 3)
+            x = points[(u @ points.T).argmax(axis=1)] + d[0] * u
+        case _:  # sphere, point; a mesh, whose corners are not here, as the point that it is about
             x = u * d[0]
     return x
 

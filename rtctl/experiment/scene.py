@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl import config as cfg
 from rtctl.config.obstacles import shape_of
 from rtctl.config.read import convert
 from rtctl.config.scenario import Scenario
 from rtctl.config.urdf import urdf_file
 from rtctl.control.robot import Robot
 from rtctl.errors import ConfigError
-from rtctl.servo import Turn
+from rtctl.servo import Servo, Turn
 from rtctl.sim import simulate
 from rtctl.types import F64, I64, Shape, Truth
 
@@ -115,8 +114,10 @@ def played(
     told: Scenario = convert({**scenario, "robot": str(config)}, Scenario, "experiment")
     rows: list[tuple[Any, ...]] = []
     clearance: dict[str, list[float]] = {}
+    robots: list[Robot] = []
 
-    def watch(truth: Truth, turn: Turn) -> None:
+    def watch(servo: Servo, truth: Truth, turn: Turn) -> None:
+        robots[:] = [servo.robot]
         record = turn.record.reshape(1)[0]
         push = np.linalg.norm(record["force"], axis=1).sum()
         rows.append((
@@ -138,8 +139,7 @@ def played(
         told_here = {**scenario, "robot": where.name}
         path.write_text("".join(f"{json.dumps(k)} = {toml(v)}\n" for k, v in told_here.items()), encoding="utf-8")
         figures = simulate(path, watch=watch)
-        robot = cfg.build(cfg.load(where), where)
     time, q, tip, x, rho, force, status, limits, tau = (np.array(column) for column in zip(*rows, strict=True))
     xd = np.gradient(tip, time, axis=0)
     columns = {k: np.array(v) for k, v in clearance.items()}
-    return Trace(robot, told, time, q, tip, xd, x, columns, rho, force, status, limits, tau, figures)
+    return Trace(robots[0], told, time, q, tip, xd, x, columns, rho, force, status, limits, tau, figures)
