@@ -1,6 +1,7 @@
 """The paper's experiments: each is played, drawn (PNG and SVG), and its numbers written (JSON).
 
-A module an experiment: `TITLE`, `CAPTION`, `run(say) -> data`, `figures(data) -> dict`, `draw(data) -> Figure`.
+A module an experiment: `TITLE`, `CAPTION`, `run(say) -> data`, `figures(data) -> dict`, `draw(data) -> Figure`; one
+whose numbers are read side by side has `table(data)` too, written as NAME.md.
 """
 
 import json
@@ -37,6 +38,8 @@ def perform(name: str, folder: Path, say: Callable[[float], None]) -> dict[str, 
         saved(module.draw(data), folder, name)
     text = json.dumps({"experiment": name, "title": module.TITLE, **figures}, indent=2, allow_nan=False)
     (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    if hasattr(module, "table"):
+        (folder / f"{name}.md").write_text(f"{module.TITLE}: `rtctl experiment {name}`\n\n{module.table(data)}\n")
     return figures
 
 

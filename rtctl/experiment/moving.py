@@ -15,9 +15,9 @@ TITLE = "A moving obstacle passes"
 CAPTION = "a ball drifts through the held tip of a Panda: still frames, and clearance and error over time"
 HOLD = np.array([0.50, 0.0, 0.45])  # [m]
 SPEED, RADIUS = 0.25, 0.08  # [m/s] half of v_max; [m]
-FROM, TO = 0.95, -0.95  # [m] y of the ball's way
+FROM, TO = 0.95, -0.60  # [m] y of the ball's way
 AT_X, AT_Z, LEAVES = 0.55, 0.53, 1.0  # [m], [m], [s]
-AFTER = 1.2  # [s] shown after the ball has gone
+AFTER = 0.8  # [s] shown after the ball has gone
 SEEN = view(np.radians(20.0), np.radians(16.0))
 
 
@@ -112,4 +112,4 @@ def _course(axes: Axes, data: Data) -> None:
     axes.set_xlim(1.5, trace.time[-1])
     axes.set_xlabel("time [s]")
     axes.set_ylabel("[mm]")
-    axes.legend(loc="upper left", ncols=1, borderaxespad=0.0)
+    axes.legend(loc="upper right", ncols=1, borderaxespad=0.0)
