@@ -79,13 +79,13 @@ def draw(data: Data) -> Figure:
     least = figures(data)["min_joint_margin_rad"]
     figure = page(
         "A turn beyond the stop of joint 7",
-        f"The hand turns in place. Least margin of any joint to its limit: {least:.2f} rad",
-        size=(11.0, 6.0),
+        f"The hand turns in place, asked along the orange line; least margin of any joint to its limit {least:.2f} rad",
+        size=(11.0, 5.2),
     )
     figurine = Figurine(data.trace.robot.body)
     for k in range(len(data.turns)):
-        _hand(figure.add_axes((0.01 + 0.175 * k, 0.25, 0.17, 0.44)), data, figurine, k)
-    _joints(figure.add_axes((0.62, 0.12, 0.365, 0.66)), data)
+        _hand(figure.add_axes((0.01 + 0.182 * k, 0.19, 0.176, 0.53)), data, figurine, k)
+    _joints(figure.add_axes((0.64, 0.14, 0.345, 0.60)), data)
     return figure
 
 
@@ -139,6 +139,6 @@ def _joints(axes: Axes, data: Data) -> None:
     axes.set_yticks([-1.0, 0.0, 1.0], ["lower\nlimit", "middle", "upper\nlimit"])
     axes.set_xlim(0.0, trace.time[-1])
     axes.set_xlabel("time [s]")
-    axes.text(0.0, 1.085, "joints in their ranges", transform=axes.transAxes, fontsize=13.5, fontweight="bold")
+    axes.text(0.0, 1.1, "joints in their ranges", transform=axes.transAxes, fontsize=13.5, fontweight="bold")
     axes.legend(loc="lower left", ncols=7, fontsize=11, bbox_to_anchor=(-0.02, 0.99), handlelength=1.0,
                 columnspacing=0.9, handletextpad=0.4, borderpad=0.1)  # fmt: skip

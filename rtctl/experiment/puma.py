@@ -79,11 +79,11 @@ def draw(data: Data) -> Figure:
         if k < len(data.goals):
             axes = figure.add_axes((0.005 + 0.33 * k, 0.36, 0.33, 0.49))
             _drawing(axes, data, figurine, OBLIQUE, k, k)
-            framed(axes, (-0.98, 0.92), (-0.52, 1.22), None)
+            framed(axes, (-0.80, 0.80), (-0.36, 1.10), None)
             axes.text(0.03, 0.94, title, transform=axes.transAxes, fontsize=13.5, fontweight="bold")
     above = figure.add_axes((0.67, 0.36, 0.325, 0.49))
     _drawing(above, data, figurine, ABOVE, 0, len(data.goals) - 1)
-    framed(above, (-0.55, 1.15), (-0.90, 0.68), None)
+    framed(above, (-0.62, 1.08), (-0.87, 0.71), None)
     above.text(0.03, 0.94, "both from above", transform=above.transAxes, fontsize=13.5, fontweight="bold")
     _clearance(figure.add_axes((0.075, 0.1, 0.91, 0.235)), data)
     return figure
