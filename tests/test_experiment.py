@@ -125,7 +125,7 @@ def test_a_panda_goes_straight_below_its_limit_and_decays_like_a_unit_mass():
 def test_the_planar_arm_keeps_every_link_off_walls_and_pillars():
     data = enclosure.run(goals=enclosure.GOALS[:2])
     numbers = enclosure.figures(data)
-    assert numbers["arrived"] == [True, True]
+    assert max(numbers["error_m"]) < 5e-3
     assert numbers["contacts"] == 0
     assert numbers["faults"] == []
     assert numbers["min_clearance_m"]["pillar"] > 0.02

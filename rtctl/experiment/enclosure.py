@@ -14,7 +14,7 @@ TITLE = "A planar arm of four joints in an enclosure"
 CAPTION = "whole-arm avoidance among walls and pillars, as stroboscopic frames, and the clearance of every moment"
 SEEN = axis_view(0, 1)
 LEFT, RIGHT, BELOW, ABOVE = -0.62, 1.62, -0.72, 1.16  # [m] the walls
-GOALS = ((0.22, 0.84), (0.14, 0.62), (1.1, 0.86))  # [m] in the plane
+GOALS = ((0.22, 0.84), (0.13, 0.67), (1.1, 0.86))  # [m] in the plane
 FIRST, EVERY = 0.5, 3.4  # [s]
 FRAMES = 7
 

@@ -133,7 +133,7 @@ def _joints(axes: Axes, data: Data) -> None:
     for k in range(len(data.turns)):
         axes.axvline(FIRST + EVERY * k, color=FAINT, lw=1.0, zorder=1)
         axes.text(FIRST + EVERY * k + 0.1, -1.09, f"goal {k + 1}", fontsize=12, va="center")
-    axes.text(0.15, 1.09, "beyond the limit", color=RED, fontsize=12, va="center")
+    axes.text(0.98 * trace.time[-1], 1.09, "beyond the limit", color=RED, fontsize=12, va="center", ha="right")
     axes.text(0.15, 1.0 - 0.5 * band, "zone", color="#9A6A00", fontsize=12, va="center")
     axes.set_ylim(-1.18, 1.18)
     axes.set_yticks([-1.0, 0.0, 1.0], ["lower\nlimit", "middle", "upper\nlimit"])
