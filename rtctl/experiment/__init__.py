@@ -39,7 +39,9 @@ def perform(name: str, folder: Path, say: Callable[[float], None]) -> dict[str, 
     text = json.dumps({"experiment": name, "title": module.TITLE, **figures}, indent=2, allow_nan=False)
     (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     if hasattr(module, "table"):
-        (folder / f"{name}.md").write_text(f"{module.TITLE}: `rtctl experiment {name}`\n\n{module.table(data)}\n")
+        (folder / f"{name}.md").write_text(
+            f"{module.TITLE}: `rtctl experiment {name} --out DIR`\n\n{module.table(data)}\n", encoding="utf-8"
+        )
     return figures
 
 

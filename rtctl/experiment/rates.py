@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
 from rtctl.experiment.style import BLUE, FAINT, INK, ORANGE, RED, Axes, note, page
@@ -126,20 +127,20 @@ def draw(data: Data) -> Figure:
     """Return the figure: three measures over the pairs, dots with the estimator, rings without it."""
     figure = page(
         "What the two levels buy",
-        "Panda, the same two goals at each pair of rates, with and without the estimator between evaluations",
+        "Panda, the same two goals at each pair of rates: free space, then past a ball",
         size=(11.0, 6.4),
     )
-    grid = figure.add_gridspec(1, 4, left=0.125, right=0.985, top=0.78, bottom=0.12, wspace=0.13)
+    grid = figure.add_gridspec(1, 4, left=0.145, right=0.985, top=0.78, bottom=0.12, wspace=0.13)
     columns = (
-        ("Tip believed\nagainst true, rms", "mm", lambda r: 1e3 * r.error, True),
-        ("Off the straight line\nin free space", "mm", lambda r: 1e3 * r.off, True),
-        ("Torque step from\nperiod to period, rms", "Nm", lambda r: r.rough, True),
-        ("Least clearance\nto the ball", "mm", lambda r: 1e3 * r.clearance, False),
+        ("Tip believed\nagainst true, rms", "mm", lambda r: 1e3 * r.error, "log"),
+        ("Off the straight line\nin free space", "mm", lambda r: 1e3 * r.off, "log"),
+        ("Torque step from\nperiod to period, rms", "Nm", lambda r: r.rough, "linear"),
+        ("Least clearance\nto the ball", "mm", lambda r: 1e3 * r.clearance, "clearance"),
     )
     axes0 = None
-    for k, (title, unit, value, logarithmic) in enumerate(columns):
+    for k, (title, unit, value, scale) in enumerate(columns):
         axes = figure.add_subplot(grid[k])
-        _column(axes, data, value, logarithmic)
+        _column(axes, data, value, scale)
         axes.set_title(title, fontsize=12.5)
         axes.set_xlabel(f"[{unit}]")
         if k == 0:
@@ -153,7 +154,7 @@ def draw(data: Data) -> Figure:
     return figure
 
 
-def _column(axes: Axes, data: Data, value: Any, logarithmic: bool) -> None:
+def _column(axes: Axes, data: Data, value: Any, scale: str) -> None:
     pairs = list(dict.fromkeys((r.servo, r.model) for r in data.runs))
     for carry in (True, False):
         runs = [r for r in data.runs if r.carry == carry]
@@ -167,8 +168,13 @@ def _column(axes: Axes, data: Data, value: Any, logarithmic: bool) -> None:
                 axes.plot(a, b, "x", ms=13, mec=RED, mew=2.0, zorder=7, clip_on=False)
     for k in range(len(pairs)):
         axes.axhline(k, color=FAINT, lw=0.6, zorder=0)
-    if logarithmic:
+    if scale == "log":
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    elif scale == "linear":
+        axes.set_xlim(left=0.0)
     else:
         axes.axvline(20.0, color=RED, lw=1.5, ls=(0, (5, 3)))
         note(axes, 20.5, len(pairs) - 0.45, "clearance", RED, ha="left", va="center", fontsize=11)
