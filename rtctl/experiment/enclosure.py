@@ -32,7 +32,7 @@ OBSTACLES = (
     _wall("right", RIGHT, 0.0, (-1.0, 0.0)),
     _wall("below", 0.0, BELOW, (0.0, 1.0)),
     _wall("above", 0.0, ABOVE, (0.0, -1.0)),
-    _pillar("pillar", 0.55, 0.42, 0.07),
+    _pillar("pillar", 0.55, 0.42, 0.05),
     _pillar("post", 1.33, 0.3, 0.07),
     {"name": "crate", "type": "box", "size_m": [0.34, 0.2, 0.4], "position_m": [0.5, -0.5, 0.0]},
 )

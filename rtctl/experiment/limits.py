@@ -14,7 +14,7 @@ TITLE = "Joint-limit avoidance"
 CAPTION = "the hand turns in place: to the edge of joint 7's zone, then beyond its limit, which it never reaches"
 PLACE = (0.50, 0.0, 0.40)  # [m]
 TURNS = (-1.9, -2.6, 0.0)  # [rad] of the hand about the vertical; joint 7 starts at 0.785 and turns the other way
-FIRST, EVERY = 0.5, 4.0  # [s]
+FIRST, EVERY = 0.5, 5.0  # [s]: two to turn, and two at rest until the controller names what holds it
 FRAMES = 6
 SEEN = axis_view(0, 1)
 

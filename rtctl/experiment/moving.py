@@ -112,4 +112,4 @@ def _course(axes: Axes, data: Data) -> None:
     axes.set_xlim(1.5, trace.time[-1])
     axes.set_xlabel("time [s]")
     axes.set_ylabel("[mm]")
-    axes.legend(loc="upper right", ncols=1, borderaxespad=0.0)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.525, 1.06), ncols=1, borderaxespad=0.0)

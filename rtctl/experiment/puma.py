@@ -79,7 +79,7 @@ def draw(data: Data) -> Figure:
         if k < len(data.goals):
             axes = figure.add_axes((0.005 + 0.33 * k, 0.36, 0.33, 0.49))
             _drawing(axes, data, figurine, OBLIQUE, k, k)
-            framed(axes, (-0.80, 0.80), (-0.36, 1.10), None)
+            framed(axes, (-0.80, 0.97), (-0.39, 1.14), None)
             axes.text(0.03, 0.94, title, transform=axes.transAxes, fontsize=13.5, fontweight="bold")
     above = figure.add_axes((0.67, 0.36, 0.325, 0.49))
     _drawing(above, data, figurine, ABOVE, 0, len(data.goals) - 1)
