@@ -34,8 +34,10 @@ PAIRS = 64  # links near obstacles or links that are guarded at a time
 def may(bound: float, speed: float, jerk: float) -> float:
     """Return the largest acceleration with which `speed` can still be kept below `bound`."""
     gap = bound - speed
-    accel = gap / SPEED_HORIZON
-    return min(accel, np.sqrt(2.0 * jerk * gap)) if gap > 0.0 else accel
+    accel: float = gap / SPEED_HORIZON
+    if gap > 0.0:
+        accel = min(accel, np.sqrt(2.0 * jerk * gap))
+    return accel
 
 
 @njit(cache=True, fastmath=False)
