@@ -52,7 +52,8 @@ def may_towards(room: float, speed: float, top: float, braking: float, jerk: flo
     if curve >= top:
         return may(top, speed, jerk)
     slope = braking * min(1.0, max(0.0, speed) / max(curve, SPEED_HORIZON * braking))
-    return may(curve, speed, jerk) - slope
+    accel: float = may(curve, speed, jerk) - slope
+    return accel
 
 
 @njit(cache=True, fastmath=False)
