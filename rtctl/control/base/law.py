@@ -45,6 +45,31 @@ class Twist(NamedTuple):
 REST = Twist(0.0, 0.0, np.zeros(2))
 
 
+def history(base: Base) -> int:
+    """Return how many twists are on their way to the wheels at most."""
+    return max(1, math.ceil(max(base.margins.lag, base.margins.turn_lag) / base.dt))
+
+
+def ahead_of(base: Base, x: F64, yaw: float, sent: F64) -> tuple[F64, float]:
+    """Return pose (x (2,) [m], yaw [rad]) that a twist sent now will meet: after those still on their way.
+
+    A vehicle answers late by a dead time and a lag of its own. Steered by where it is it weaves; steered by where
+    what was sent will have brought it, it does not (Smith's predictor).
+    """
+    return _ahead_of(x, yaw, sent, base.margins.lag / base.dt, base.margins.turn_lag / base.dt, base.dt)
+
+
+@njit(cache=True, fastmath=False)
+def _ahead_of(x: F64, yaw: float, sent: F64, lag: float, turn_lag: float, dt: float) -> tuple[F64, float]:
+    px, py = x[0], x[1]
+    for k in range(sent.shape[0] - 1, -1, -1):  # the oldest first
+        share_v, share_w = min(max(lag - k, 0.0), 1.0), min(max(turn_lag - k, 0.0), 1.0)
+        yaw += dt * share_w * sent[k, 1]
+        px += dt * share_v * sent[k, 0] * math.cos(yaw)
+        py += dt * share_v * sent[k, 0] * math.sin(yaw)
+    return np.array([px, py]), yaw
+
+
 def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, obstacles: Obstacles) -> Push:
     """Return the field at x (2,) [m], yaw [rad], moving at v (2,) [m/s]; seen (m, 2) [m] are returns."""
     c, s = math.cos(yaw), math.sin(yaw)

@@ -56,3 +56,4 @@ class BaseMemory(NamedTuple):
     v_ref: F64  # (2,) [m/s]
     v: float  # [m/s] last sent
     w: float  # [rad/s]
+    sent: F64  # (h, 2) the last twists [m/s, rad/s], newest first: what is still on its way to the wheels

@@ -55,6 +55,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         jump=False, rest=0, last=feedback, goal=None, goal_rho=far, status=Status.NO_GOAL, blocker=-1, nearest=np.inf,
         still=0, world=table, chart=seen, free=chart.free_distance(seen, table.obstacles, base.margins.height),
         scan=np.zeros((0, 2)), way=detour.NO_WAY, due=0, rho=far, rho_seen=np.inf, v_ref=np.zeros(2), v=0.0, w=0.0,
+        sent=np.zeros((law.history(base), 2)),
     )  # fmt: skip
 
 
@@ -133,8 +134,7 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
 
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
     """Evaluate field and goal at the state that a set-point sent now will meet."""
-    lag = base.margins.lag
-    x, yaw = m.here.x + lag * m.here.v, m.here.yaw + lag * m.here.yaw_rate
+    x, yaw = _ahead(base, m)
     seen = _surroundings(base, m, f)
     push = law.field(base, m.here.x, m.here.yaw, m.here.v, seen, m.world.obstacles)
     moves = driving(m) and m.state == State.RUN and severity(m.in_force) < Severity.SS2
@@ -142,8 +142,9 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     if moves:
         total = push.seen + push.told.sum(axis=0)
         if m.goal is not None and m.status != Status.ARRIVED and len(m.way.corners):
-            ahead = max(m.way.length - float(np.hypot(*(x - m.here.x))), 0.0)
-            xd_d = law.desired(base, x, m.way.corners[0], ahead)
+            way = detour.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
+            way = way if len(way.corners) else m.way  # from where it will be no corner is in sight: head on
+            xd_d = law.desired(base, x, way.corners[0], way.length)
     v_ref = law.integrated(base, m.v_ref, xd_d, total, elapsed) if driving(m) else np.zeros(2)
     if m.state == State.RUN and not moves:
         v_ref = np.zeros(2)  # SS2: zero twist, at once
@@ -155,6 +156,13 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     allowed = law.allowed_speed(base, m.here.x, direction, base.limits.v_max, seen, m.world.obstacles, push)
     m = m._replace(rho=push.rho, rho_seen=push.rho_seen)
     return m, (v_ref, push, xd_d, allowed)
+
+
+def _ahead(base: Base, m: BaseMemory) -> tuple[F64, float]:
+    """Return the pose that a command sent now will meet."""
+    if base.world_velocity or base.wheels == Wheels.HOLONOMIC:
+        return m.here.x + base.margins.lag * m.here.v, m.here.yaw
+    return law.ahead_of(base, m.here.x, m.here.yaw, m.sent)
 
 
 def _commanded(
@@ -170,15 +178,15 @@ def _commanded(
     elif ask == Ask.DRIVE:
         speed = float(np.hypot(*v_ref))
         velocity = v_ref * min(1.0, allowed / speed) if speed > 1e-6 else np.zeros(2)
-        yaw = m.here.yaw + base.margins.lag * m.here.yaw_rate
-        v, w = law.unicycle(base, v_ref, yaw)
+        v, w = law.unicycle(base, v_ref, _ahead(base, m)[1])
         v = math.copysign(min(abs(v), allowed), v)
         if m.state == State.RUN:
             v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
             w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
     if m.state != State.RUN and ask == Ask.DRIVE and m.state != State.STOPPING:
         v, w, velocity = 0.0, 0.0, np.zeros(2)
-    return m._replace(v_ref=v_ref, v=v, w=w), BaseCommand(ask, v, w, velocity)
+    sent = np.concatenate([[[v, w]], m.sent[:-1]])
+    return m._replace(v_ref=v_ref, v=v, w=w, sent=sent), BaseCommand(ask, v, w, velocity)
 
 
 def _asked(base: Base, m: BaseMemory, f: BaseFeedback) -> Ask:

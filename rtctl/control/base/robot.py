@@ -35,7 +35,8 @@ class Margins(NamedTuple):
     room: float  # [m] free distance of a cell's centre that a way keeps to
     stop: float  # [m] the speed governor brings the base to rest at this distance
     brake: float  # [m/s2] it relies on
-    lag: float  # [s] from a set-point to the motion; the state is predicted by it
+    lag: float  # [s] from a set-point to the speed it asks for; the state is predicted by it
+    turn_lag: float  # [s] the same of the yaw rate
     height: float  # [m] where told obstacles, which are solids, are cut
 
 
