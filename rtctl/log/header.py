@@ -15,7 +15,7 @@ import numpy as np
 from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
 
-PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
+PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet", "pymavlink")
 
 MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
@@ -36,6 +36,7 @@ class Header(NamedTuple):
     revision: str  # of the program's own repository, "" when it does not run from one
     extra: Mapping[str, str]  # handshake values, realtime settings, ...
     files: Mapping[str, str]  # further attachments: name -> text (scenario, DBC)
+    links: tuple[str, ...] = ()  # MAVLink; an entry's `kind >> 8` is the index
 
     @property
     def config_sha256(self) -> str:
@@ -150,4 +151,5 @@ def header_from_json(text: str) -> Header:
         revision=str(raw["revision"]),
         extra={str(k): str(v) for k, v in raw["extra"].items()},
         files={str(k): str(v) for k, v in raw["files"].items()},
+        links=tuple(map(str, raw.get("links", ()))),
     )
