@@ -76,7 +76,11 @@ class Rover:
         self.autopilot = Autopilot(link["autopilot"], self.vehicle, end, int(link.get("system_id", 245)))
         self.outline, self.radius = _outline(base)
         self.tables = [*config.get("obstacle", ()), *obstacles]
-        plane.solids_at(self.tables, 0.0)  # complains now, not later
+        still = [not (t.get("waypoints") or any(t.get("velocity_m_s", ())) or "appears_s" in t or "vanishes_s" in t)
+                 for t in self.tables]  # fmt: skip
+        self._still = plane.solids_at([t for t, rests in zip(self.tables, still, strict=True) if rests], 0.0)
+        self._moving = [t for t, rests in zip(self.tables, still, strict=True) if not rests]
+        plane.solids_at(self._moving, 0.0)  # complains now, not later
         self.faults, self.done = list(faults), set[int]()
         self.started = not wait
         self.time = 0.0  # [s] of the scenario
@@ -110,13 +114,16 @@ class Rover:
         if pilot.time >= self._scan_due:
             self._scan_due += 1.0 / SCAN_HZ
             v = self.vehicle
-            solids = plane.solids_at(self.tables, self.time)
-            pilot.scan = plane.scan(solids, v.x, v.y, v.yaw, SECTORS, RAYS, REACH).tolist()
+            pilot.scan = plane.scan(self.solids(), v.x, v.y, v.yaw, SECTORS, RAYS, REACH).tolist()
             pilot.scan_new = True
         said = pilot.step(self.period)
         self._truth = None
-        self._touch()
+        self.truth()
         return said
+
+    def solids(self) -> list[plane.Solid]:
+        """Return what stands in the world now."""
+        return [*self._still, *plane.solids_at(self._moving, self.time)]
 
     def _active(self, kind: str) -> bool:
         now = round(self.time * NS)
@@ -148,18 +155,16 @@ class Rover:
 
     def _clearances(self) -> dict[str, float]:
         outline = self._placed()
-        return {s.name: plane.clearance(s, outline, self.radius) for s in plane.solids_at(self.tables, self.time)}
-
-    def _touch(self) -> None:
-        touching = {name for name, d in self._clearances().items() if d <= 0.0}
-        self.contacts += len(touching - self._touching)
-        self._touching = touching
+        return {s.name: plane.clearance(s, outline, self.radius) for s in self.solids()}
 
     def truth(self) -> Truth:
         """Return where the vehicle really is and what it is near to."""
         if self._truth is None:
-            v = self.vehicle
-            self._truth = Truth(self.time, v.x, v.y, v.yaw, v.v, v.w, self._clearances(), self.contacts)
+            v, clearance = self.vehicle, self._clearances()
+            touching = {name for name, d in clearance.items() if d <= 0.0}
+            self.contacts += len(touching - self._touching)
+            self._touching = touching
+            self._truth = Truth(self.time, v.x, v.y, v.yaw, v.v, v.w, clearance, self.contacts)
         return self._truth
 
     def close(self) -> None:
