@@ -14,6 +14,7 @@ from rtctl.config.obstacles import Name, Obstacle, refuse_obstacles
 from rtctl.config.read import convert, name_place, parse
 from rtctl.config.rules import Found
 from rtctl.config.structs import ConsoleTable, LogTable, Table, Text
+from rtctl.control.base.chart import CELL, STENCIL
 from rtctl.control.firas import eta_of, rho_num_of
 from rtctl.errors import ConfigError
 from rtctl.protocol.signing import KEY
@@ -245,6 +246,10 @@ def _distances(c: BaseConfig) -> Iterator[Found]:
     if a.clearance_m >= a.influence_m:
         yield Found("avoid.clearance_m", a.clearance_m, f"less than influence_m = {a.influence_m:g}")
         return
+    room = hull(c) + a.clearance_m + math.sqrt(0.5) * CELL
+    if room > (STENCIL - 1) * CELL:
+        why = f"with the footprint's {hull(c):.3g} at most {(STENCIL - 1) * CELL - math.sqrt(0.5) * CELL:.3g}"
+        yield Found("avoid.clearance_m", a.clearance_m, why)
     if a.stop_m >= a.clearance_m:
         # a way runs at clearance_m: a governor that stops there would never let it pass
         yield Found("avoid.stop_m", a.stop_m, f"less than clearance_m = {a.clearance_m:g}")

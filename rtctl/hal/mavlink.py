@@ -26,6 +26,7 @@ from rtctl.types import Link
 
 HEARTBEAT = 1.0  # [s] between ours
 TIMESYNC = 1.0  # [s]
+SILENT = 1.0  # [s] without a position from a vehicle that is there: its streams are asked for anew
 TIMESYNC_FAST = 0.1  # [s] until clocks are agreed
 PRESTREAM = 1.3  # [s] of set-points before PX4 may be asked for OFFBOARD: it wants more than one
 WINDOW = 64  # sequence numbers within which a late message is no loss
@@ -99,6 +100,7 @@ class MavLink:
         self._setpoints_since = -1.0
         self._word = Word.PENDING
         self._reboots = 0
+        self._subscribed = math.inf  # [s] when streams were asked for
 
     # -- reading -------------------------------------------------------------------------------------------------
 
@@ -106,7 +108,8 @@ class MavLink:
         """Return what is known of the vehicle at this slot."""
         self._drain()
         now, v = self.wire.now(), self.view
-        if v.reboots != self._reboots:
+        silent = now - v.position_at > SILENT and now - v.heartbeat_at < HEARTBEAT + 1.0
+        if v.reboots != self._reboots or (silent and self.talk.idle and self._subscribed < now - SILENT):
             self._reboots = v.reboots
             self._subscribe()
         return BaseFeedback(
@@ -336,6 +339,7 @@ class MavLink:
 
     def _subscribe(self) -> None:
         """Ask for every stream, anew after the autopilot started anew."""
+        self._subscribed = self.wire.now()
         left_out = ONLY[self.spec.autopilot]
         for name, (message, rate) in STREAMS.items():
             if name not in left_out:

@@ -213,6 +213,7 @@ class View:
     def _timesync(self, m: Any, now: float) -> None:
         if m.tc1 > 0 and m.ts1 in self.asked:  # an answer to ours: ts1 is what we sent
             self.asked.remove(m.ts1)
+            self._in_order("TIMESYNC", 1e-9 * m.tc1)  # an autopilot that started anew has forgotten its streams
             self.clock.answer(1e-9 * m.ts1, 1e-9 * m.tc1, now)
 
 

@@ -17,6 +17,7 @@ from rtctl.types import F64, I64
 SIZE = 192  # cells a side
 CELL = 0.35  # [m]
 SURE = 3  # looks through a cell that forget a return in it
+STENCIL = 12  # cells: free distances are told up to this many, and as this many beyond
 MARGIN = 24  # cells between the base and the window's edge before the window is moved
 U8Grid = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 
@@ -115,7 +116,7 @@ def _look(
 def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
     """Return the distance (SIZE, SIZE) [m] of each cell's centre to the nearest return or told obstacle.
 
-    height [m] is where the told obstacles, which are solids, are cut.
+    Beyond STENCIL cells it is that many: nobody asks how much further. height [m] is where the told obstacles, which are solids, are cut.
     """
     field = np.empty((SIZE, SIZE))
     _free(chart.cells, chart.origin, obstacles, height, field)
@@ -124,18 +125,17 @@ def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
 
 @njit(cache=True, fastmath=False)
 def _free(cells: U8Grid, origin: I64, obstacles: Obstacles, height: float, field: F64) -> None:
-    far = 1e6
+    far = STENCIL * CELL
+    field[:] = far
     for i in range(SIZE):
         for j in range(SIZE):
-            field[i, j] = 0.0 if cells[i, j] > 0 else far
-    for i in range(SIZE):
-        _envelope(field[i, :])
-    column = np.empty(SIZE)
-    for j in range(SIZE):
-        column[:] = field[:, j]
-        _envelope(column)
-        for i in range(SIZE):
-            field[i, j] = math.sqrt(column[i]) * CELL
+            if cells[i, j] == 0:
+                continue
+            for a in range(max(0, i - STENCIL), min(SIZE, i + STENCIL + 1)):
+                for b in range(max(0, j - STENCIL), min(SIZE, j + STENCIL + 1)):
+                    d = CELL * math.sqrt(float((a - i) * (a - i) + (b - j) * (b - j)))
+                    if d < field[a, b]:
+                        field[a, b] = d
     P, none, out = np.empty((3, SIZE)), np.zeros(SIZE), np.empty((1, 4, SIZE))
     for k in range(obstacles.active.shape[0]):
         if not obstacles.active[k]:
@@ -152,28 +152,6 @@ def _free(cells: U8Grid, origin: I64, obstacles: Obstacles, height: float, field
             for j in range(SIZE):
                 if out[0, 0, j] < field[i, j]:
                     field[i, j] = max(out[0, 0, j], 0.0)
-
-
-@njit(cache=True, fastmath=False)
-def _envelope(f: F64) -> None:
-    """Replace f by min_q (p - q)^2 + f(q) for every p: the lower envelope of parabolas, linear in their number."""
-    n = f.shape[0]
-    at, edge, out = np.empty(n, np.int64), np.empty(n + 1), np.empty(n)
-    k = 0
-    at[0], edge[0], edge[1] = 0, -math.inf, math.inf
-    for q in range(1, n):
-        s = ((f[q] + q * q) - (f[at[k]] + at[k] * at[k])) / (2.0 * (q - at[k]))
-        while s <= edge[k]:
-            k -= 1
-            s = ((f[q] + q * q) - (f[at[k]] + at[k] * at[k])) / (2.0 * (q - at[k]))
-        k += 1
-        at[k], edge[k], edge[k + 1] = q, s, math.inf
-    k = 0
-    for p in range(n):
-        while edge[k + 1] < p:
-            k += 1
-        out[p] = (p - at[k]) * (p - at[k]) + f[at[k]]
-    f[:] = out
 
 
 def returns_near(chart: Chart, x: F64, reach: float) -> F64:

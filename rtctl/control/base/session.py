@@ -83,7 +83,7 @@ def _followed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> BaseM
     if m.state in (State.ARMED, State.RUN) and f.ours:
         m = m._replace(entered=True, mine=m.mine or f.armed)
     if taken or (m.mine and not f.armed):
-        m = m._replace(mine=False)
+        m = m._replace(mine=False, entered=False)
     if m.state == State.SAFE_STOP and not m.off:
         elapsed = (m.tick - m.since) * base.dt
         over = m.rest * base.dt >= REST_HOLD or elapsed >= STOP_TIME
