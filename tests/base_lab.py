@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_sim import plane
 from firmware_sim.rover import Rover, open_rover
 from rtctl.base import machine_of, open_link
 from rtctl.config.base import load
@@ -108,3 +109,52 @@ class BaseLab:
     @property
     def speed(self) -> float:
         return abs(self.rover.truth().v)
+
+
+class Relay:
+    """A poor radio in user space: packets are lost, late, and overtake each other; the same every time."""
+
+    def __init__(self, period: float, loss: float = 0.0, delay: float = 0.0, jitter: float = 0.0, seed: int = 0):
+        """`delay` and `jitter` [s] each way; `jitter` is added to every fourth packet alone: those are overtaken."""
+        self.random = np.random.default_rng(seed)
+        self.period, self.loss, self.delay, self.jitter = period, loss, delay, jitter
+        self.cycle = {"up": 0, "down": 0}
+        self.held: dict[str, list[tuple[float, int, bytes]]] = {"up": [], "down": []}
+        self.count = self.lost = 0
+
+    def __call__(self, way: str, packets: list[bytes]) -> list[bytes]:
+        self.cycle[way] += 1
+        now = self.cycle[way] * self.period
+        for packet in packets:
+            self.count += 1
+            if self.random.random() < self.loss:
+                self.lost += 1
+                continue
+            late = self.delay + (self.jitter if self.random.random() < 0.25 else 0.0)
+            self.held[way].append((now + late, self.count, packet))
+        due = sorted(entry for entry in self.held[way] if entry[0] <= now + 1e-9)
+        self.held[way] = [entry for entry in self.held[way] if entry[0] > now + 1e-9]
+        return [packet for _, _, packet in due]
+
+
+def some_world(seed: int, size: float = 14.0, solids: int = 10) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
+    """Return ten random discs and boxes around the origin, and 20 places that are free."""
+    random, tables = np.random.default_rng(seed), []
+    while len(tables) < solids:
+        x, y = random.uniform(-size, size, 2)
+        if np.hypot(x, y) < 4.5:
+            continue
+        place = {"name": f"o{len(tables)}", "position_m": [float(x), float(y), 0.0]}
+        if random.random() < 0.5:
+            place |= {"type": "cylinder", "radius_m": float(random.uniform(0.4, 1.5)), "length_m": 2.0}
+        else:
+            a, b, yaw = random.uniform((0.8, 0.8, 0.0), (4.0, 2.0, np.pi))
+            place |= {"type": "box", "size_m": [float(a), float(b), 2.0], "rpy_rad": [0.0, 0.0, float(yaw)]}
+        tables.append(place)
+    there, places = plane.solids_at(tables, 0.0), []
+    while len(places) < 20:
+        at = random.uniform(-size, size, 2)
+        near = places[-1] if places else np.zeros(2)
+        if np.hypot(*(at - near)) < 0.8 * size and min(plane.distance(s, at[None])[0] for s in there) > 1.5:
+            places.append(at)
+    return tables, places

@@ -28,7 +28,7 @@ class Push(NamedTuple):
 
     seen: F64  # (2,) [m/s2] of the returns of the scan and of the chart, one union
     told: F64  # (K, 2) [m/s2] of each told obstacle
-    rho_seen: float  # [m] to the nearest return, infinite without one
+    rho_seen: float  # [m] to the nearest return of the newest scan, infinite without one
     rho: F64  # (K,) [m] to each told obstacle, infinite where there is none
     closing: F64  # (K,) [m/s] of each told obstacle towards the base by its own motion
     normal: F64  # (K, 2)
@@ -70,12 +70,16 @@ def _ahead_of(x: F64, yaw: float, sent: F64, lag: float, turn_lag: float, dt: fl
     return np.array([px, py]), yaw
 
 
-def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, obstacles: Obstacles) -> Push:
-    """Return the field at x (2,) [m], yaw [rad], moving at v (2,) [m/s]; seen (m, 2) [m] are returns."""
+def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, now: int, obstacles: Obstacles) -> Push:
+    """Return the field at x (2,) [m], yaw [rad], moving at v (2,) [m/s].
+
+    seen (m, 2) [m] are returns, the first `now` of them of the newest scan: the others are known to a cell alone, good
+    to be pushed by, too coarse to say how near something is.
+    """
     c, s = math.cos(yaw), math.sin(yaw)
     points = x + base.points @ np.array([[c, s], [-s, c]])
     f = base.field
-    push, rho_seen = _seen(points, base.point_radius, v, seen, f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d)
+    push, rho_seen = _seen(points, base.point_radius, v, seen, now, f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d)
     told = _told(
         points, base.point_radius, v, obstacles, base.margins.height,
         f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d, f.look_ahead,
@@ -85,7 +89,7 @@ def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, obstacles: Obstacle
 
 @njit(cache=True, fastmath=False)
 def _seen(
-    points: F64, radius: F64, v: F64, seen: F64,
+    points: F64, radius: F64, v: F64, seen: F64, now: int,
     rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float,
 ) -> tuple[F64, float]:  # fmt: skip
     """Return (push (2,), rho) of a union of returns.
@@ -103,7 +107,8 @@ def _seen(
                 rho = d - radius[j]
                 if d > 1e-9:
                     nx, ny = dx / d, dy / d
-        nearest = min(nearest, rho)
+        if i < now:
+            nearest = min(nearest, rho)
         if rho >= rho0:
             continue
         a, d = firas(rho, nx * v[0] + ny * v[1], rho0, rho_min, rho_num, eta, k_d)

@@ -104,15 +104,16 @@ def _returns(x: F64, yaw: float, f: BaseFeedback, reach: float) -> F64:
     return x + f.scan[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _surroundings(base: Base, m: BaseMemory, f: BaseFeedback) -> F64:
-    """Return every return (m, 2) [m] near the base: of the last scan, the chart, and single sensors."""
+def _surroundings(m: BaseMemory, f: BaseFeedback) -> tuple[F64, int]:
+    """Return every return (m, 2) [m] near the base, and how many are of the newest scan and single sensors: first."""
     x, yaw = m.here.x, m.here.yaw
-    parts = [chart.returns_near(m.chart, x, NEAR), m.scan]
+    parts = [m.scan]
     hit = f.beams >= 0.0
     if hit.any():
         angle = yaw - 0.25 * np.pi * np.flatnonzero(hit)
         parts.append(x + f.beams[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    return np.concatenate(parts)
+    now = sum(map(len, parts))
+    return np.concatenate([*parts, chart.returns_near(m.chart, x, NEAR)]), now
 
 
 def _guided(base: Base, m: BaseMemory) -> BaseMemory:
@@ -135,8 +136,8 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
     """Evaluate field and goal at the state that a set-point sent now will meet."""
     x, yaw = _ahead(base, m)
-    seen = _surroundings(base, m, f)
-    push = law.field(base, m.here.x, m.here.yaw, m.here.v, seen, m.world.obstacles)
+    seen, now = _surroundings(m, f)
+    push = law.field(base, m.here.x, m.here.yaw, m.here.v, seen, now, m.world.obstacles)
     moves = driving(m) and m.state == State.RUN and severity(m.in_force) < Severity.SS2
     xd_d, total = np.zeros(2), np.zeros(2)
     if moves:
