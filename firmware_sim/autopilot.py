@@ -324,5 +324,3 @@ class Autopilot:
 
     def _ms(self) -> int:
         return round(self.uptime * 1e3)
-
-

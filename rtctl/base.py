@@ -23,7 +23,7 @@ from rtctl.hal.wire import Wire, open_wire
 from rtctl.log.entry import Kind
 from rtctl.log.header import Header, make_header
 from rtctl.servo import Machine, Servo, Sink
-from rtctl.types import State, Status
+from rtctl.types import State, Status, Task
 
 LINK = "vehicle"  # the link's name in the log
 MAV_TX, MAV_RX = int(Kind.MAV_TX), int(Kind.MAV_RX)
@@ -92,7 +92,7 @@ def blocker_name(m: BaseMemory) -> str:
 
 def bounds_of(base: Base, link: MavLink) -> Bounds:
     """Return what goals are held to; places in latitude and longitude go through the vehicle's origin."""
-    return Bounds((0.0, 0.0, 0.0), base.reach, base.tolerance, ANGLE_TOLERANCE, link.local)
+    return Bounds((0.0, 0.0, 0.0), base.reach, base.tolerance, ANGLE_TOLERANCE, Task.X | Task.Y, link.local)
 
 
 def header_of(config: BaseConfig, path: Path, base: Base, start: BaseFeedback, **extra: str) -> Header:

@@ -134,7 +134,7 @@ def simulate_base(
     base = build(config, where)
     if scenario.start_q_rad is not None:
         raise ConfigError(f"{source}: start_q_rad", "angles", "nothing: a base has start_pose")
-    rover: Any = open_simulator(where, scenario)
+    rover: Any = open_simulator(where, scenario, source)
     link = open_link(config, where, InProcess(rover.exchange, base.dt))
     sink = None
     try:

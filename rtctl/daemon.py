@@ -328,7 +328,9 @@ ARM_FAMILY = Family(
     lock=lambda config: (bus_resource(config.link.interface, config.link.channel), "link.channel"),
     place=lambda config: f"{config.link.interface}:{config.link.channel}",
     open=_opened,
-    bounds=lambda robot, link: Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes),
+    bounds=lambda robot, link: Bounds(
+        tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
+    ),
     greet=_greeted,
     machine=lambda link: ARM,
     header=lambda config, path, robot, start: header_of(config, path, robot, start.q),

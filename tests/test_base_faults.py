@@ -99,7 +99,9 @@ def test_engage_refused_stays_idle_and_shows_the_whole_reason():
     assert lab.run(5.0, lambda: lab.m.state == State.IDLE)
     assert "engage_refused" in lab.seen
     texts = [detail for _, name, detail in lab.servo.events if name == "vehicle"]
-    assert any("Radio failsafe on, hardware safety switch is on and the battery is below its arming" in t for t in texts)
+    assert any(
+        "Radio failsafe on, hardware safety switch is on and the battery is below its arming" in t for t in texts
+    )
     assert any(t == "arming: failed" for t in texts)
 
 

@@ -80,7 +80,12 @@ def test_a_goal_beside_an_obstacle_is_called_shadowed_and_one_shut_in_a_local_mi
     assert not lab.arrive(6.5, 0.0, seconds=13.0)
     assert lab.m.status == Status.SHADOWED
     assert lab.least > 0.5
-    walls = [((0.3, 10.0), (6.0, 0.0)), ((0.3, 10.0), (-6.0, 0.0)), ((12.0, 0.3), (0.0, 5.0)), ((12.0, 0.3), (0.0, -5.0))]
+    walls = [
+        ((0.3, 10.0), (6.0, 0.0)),
+        ((0.3, 10.0), (-6.0, 0.0)),
+        ((12.0, 0.3), (0.0, 5.0)),
+        ((12.0, 0.3), (0.0, -5.0)),
+    ]
     room = [
         {"name": f"w{i}", "type": "box", "size_m": [*size, 2.0], "position_m": [*at, 0.0]}
         for i, (size, at) in enumerate(walls)

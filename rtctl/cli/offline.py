@@ -40,8 +40,12 @@ def add_after(commands: Commands) -> None:
     schema = command(
         commands, "schema", "print a JSON Schema, for editors", "rtctl schema config > configs/schema.json", _schema
     )
-    schema.add_argument("what", choices=("config", "base", "scenario", "request"), nargs="?", default="config", metavar="WHAT")
-    schema.description = "Print the JSON Schema of WHAT: config (default: an arm's), base, scenario, or request to the control socket."
+    schema.add_argument(
+        "what", choices=("config", "base", "scenario", "request"), nargs="?", default="config", metavar="WHAT"
+    )
+    schema.description = (
+        "Print the JSON Schema of WHAT: config (default: an arm's), base, scenario, or request to the control socket."
+    )
     doctor = command(commands, "doctor", "can this machine do it", "rtctl doctor --json", _doctor)
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     doctor.add_argument(

@@ -42,7 +42,9 @@ def add(commands: Commands) -> None:
     example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
     goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
-        goal.add_argument(axis, metavar=axis.upper(), type=number, nargs="?", help="in the world frame [m]; a base's Z is 0")
+        goal.add_argument(
+            axis, metavar=axis.upper(), type=number, nargs="?", help="in the world frame [m]; a base's Z is 0"
+        )
     goal.add_argument("--latlon", metavar=("LAT", "LON"), nargs=2, type=number, help="of a base instead of X Y [deg]")
     turn = goal.add_mutually_exclusive_group()
     turn.add_argument("--rpy", metavar=("R", "P", "Y"), nargs=3, type=number, help="roll, pitch, yaw [rad]")

@@ -41,9 +41,12 @@ class BaseTable(Table, frozen=True, kw_only=True):
     """The vehicle: its outline, its wheels and how late they answer."""
 
     wheels: Literal["holonomic", "skid", "ackermann"]
-    footprint_m: Annotated[
-        tuple[tuple[Metre, Metre], ...], Meta(min_length=3, max_length=64, description="corners, front +x, left +y")
-    ] | None = None
+    footprint_m: (
+        Annotated[
+            tuple[tuple[Metre, Metre], ...], Meta(min_length=3, max_length=64, description="corners, front +x, left +y")
+        ]
+        | None
+    ) = None
     radius_m: Annotated[float, Meta(ge=0.02, le=10.0, description="of a round footprint")] | None = None
     control_point_m: Annotated[float, Meta(ge=0.05, le=5.0, description="ahead of the axle; steers gently when far")]
     turn_radius_m: Annotated[float, Meta(ge=0.0, le=50.0, description="smallest of a turn; 0 on the spot")] = 0.0
@@ -73,11 +76,15 @@ class BaseLink(Table, frozen=True, kw_only=True):
     autopilot: Literal["ardupilot", "px4"]
     signing: Annotated[Literal["required", "off"], Meta(description="MAVLink 2 signing, both ways")]
     key_file: Annotated[Text, Meta(description="32 bytes, or 64 hexadecimal digits; mode 0600")] | None = None
-    state_file: Annotated[Text, Meta(description="where timestamps of signed streams are kept over restarts")] | None = None
+    state_file: (
+        Annotated[Text, Meta(description="where timestamps of signed streams are kept over restarts")] | None
+    ) = None
     signing_link_id: Annotated[int, Meta(ge=0, le=255)] = 0
     system_id: Annotated[Id, Meta(description="ours")] = 245
     component_id: Annotated[Id, Meta(description="ours; 191 is an onboard computer")] = 191
-    vehicle_id: Annotated[Id, Meta(description="the vehicle's system id")] | None = None  # None: the first autopilot heard
+    vehicle_id: Annotated[Id, Meta(description="the vehicle's system id")] | None = (
+        None  # None: the first autopilot heard
+    )
     handshake_s: Annotated[float, Meta(ge=1.0, le=120.0, description="the vehicle must have answered within")] = 15.0
 
 
@@ -193,7 +200,9 @@ def _shape(c: BaseConfig) -> Iterator[Found]:
 def _around_origin(corners: tuple[tuple[float, float], ...]) -> bool:
     """Return whether a polygon goes once around the origin, seen from where its angle rises all along."""
     angles = [math.atan2(y, x) for x, y in corners]
-    turns = [(b - a + math.pi) % (2.0 * math.pi) - math.pi for a, b in zip(angles, angles[1:] + angles[:1], strict=True)]
+    turns = [
+        (b - a + math.pi) % (2.0 * math.pi) - math.pi for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
+    ]
     if all(t < 0.0 for t in turns):
         turns = [-t for t in turns]
     return all(t > 0.0 for t in turns) and abs(sum(turns) - 2.0 * math.pi) < 1e-6
@@ -210,7 +219,7 @@ def _link(c: BaseConfig) -> Iterator[Found]:
     elif scheme == "serial" and not rest.rpartition(":")[2].isdigit():
         yield Found("link.url", link.url, f"serial:{SCHEMES[scheme]}")
     if link.signing == "required" and link.key_file is None:
-        yield Found("link.key_file", "nothing", "the file of the key, or signing = \"off\"")
+        yield Found("link.key_file", "nothing", 'the file of the key, or signing = "off"')
     if link.signing == "off" and link.key_file is not None:
         yield Found("link.signing", "off", "required: a key_file is given")
     if link.signing == "required" and link.state_file is None:
@@ -232,7 +241,9 @@ def _rates(c: BaseConfig) -> Iterator[Found]:
     if c.loop.plan_hz > c.loop.servo_hz:
         yield Found("loop.plan_hz", c.loop.plan_hz, f"at most servo_hz = {c.loop.servo_hz:g}")
     if s.heartbeat_hold_s >= s.heartbeat_stop_s:
-        yield Found("safety.heartbeat_hold_s", s.heartbeat_hold_s, f"less than heartbeat_stop_s = {s.heartbeat_stop_s:g}")
+        yield Found(
+            "safety.heartbeat_hold_s", s.heartbeat_hold_s, f"less than heartbeat_stop_s = {s.heartbeat_stop_s:g}"
+        )
     if s.heartbeat_hold_s < 1.0:
         yield Found("safety.heartbeat_hold_s", s.heartbeat_hold_s, "at least 1: heartbeats come once a second")
     if s.stale_hold_ms < 2.0 * period:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtctl.config.assets import load_assets, placed
 from rtctl.config.base import BaseConfig, braking_distance, hull, read_key
 from rtctl.config.obstacles import shape_of
 from rtctl.config.read import name_place
@@ -26,6 +27,9 @@ def build(c: BaseConfig, path: str | Path) -> Base:
     """Return the base of a checked config; `path` is its file. Raises ConfigError."""
     dt = 1.0 / c.loop.servo_hz
     points, radius = _points(c)
+    assets = load_assets((), c.obstacle, Path(path))
+    shapes = [shape_of(o) for o in c.obstacle]
+    obstacles = tuple(placed(s, assets.clouds[s.name]) if s.name in assets.clouds else s for s in shapes)
     b, m, a, s = c.base, c.motion, c.avoid, c.safety
     base = Base(
         name=c.robot.name,
@@ -51,7 +55,8 @@ def build(c: BaseConfig, path: str | Path) -> Base:
             s.heartbeat_hold_s, s.heartbeat_stop_s, 1e-3 * s.stale_hold_ms, 1e-3 * s.stale_stop_ms, s.scan_stale_s,
             a.scan == "required", s.obstacle_stale_s, s.jump_m,
         ),
-        obstacles=tuple(shape_of(o) for o in c.obstacle),
+        obstacles=obstacles,
+        meshes=assets.meshes,
         reach=b.reach_m,
         tolerance=m.tolerance_m,
         stall=s.stall_s,
@@ -60,10 +65,12 @@ def build(c: BaseConfig, path: str | Path) -> Base:
     )  # fmt: skip
     at = np.column_stack([points, np.full(len(points), b.height_m)])
     for i, shape in enumerate(base.obstacles):
-        rho = distance(shape, at)[0] - radius
+        rho = distance(shape, at, assets.meshes)[0] - radius
         if rho.min() <= 0.0:
             place = name_place(str(path), f"obstacle[{i}].position_m")
-            raise ConfigError(place, f"{shape.name} {-rho.min():.3g} m inside the footprint at the origin", "clear of it")
+            raise ConfigError(
+                place, f"{shape.name} {-rho.min():.3g} m inside the footprint at the origin", "clear of it"
+            )
     return base
 
 

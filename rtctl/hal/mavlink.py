@@ -270,11 +270,18 @@ class MavLink:
             word = answers.get(name, Word.PENDING)
             if word not in (Word.PENDING, Word.ACCEPTED):
                 if self._word == Word.PENDING:
-                    self.news.append(f"{'arming' if name == 'arm' else 'our mode'}: {word.name.lower().replace('_', ' ')}")
+                    self.news.append(
+                        f"{'arming' if name == 'arm' else 'our mode'}: {word.name.lower().replace('_', ' ')}"
+                    )
                 self._word = word
                 return
         streamed = self._setpoints_since >= 0.0 and now - self._setpoints_since >= self.stack.prestream
-        if not ours and "mode" not in answers and not self.talk.holds("mode") and (streamed or not self.stack.prestream):
+        if (
+            not ours
+            and "mode" not in answers
+            and not self.talk.holds("mode")
+            and (streamed or not self.stack.prestream)
+        ):
             self.talk.give(Order("mode", MODE, (1.0, *self.stack.enter, 0.0, 0.0, 0.0, 0.0)), first=True)
         if ours and not self.view.armed and "arm" not in answers and not self.talk.holds("arm"):
             self.talk.give(Order("arm", ARM, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), first=True)

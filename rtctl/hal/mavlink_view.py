@@ -1,6 +1,6 @@
 """What the vehicle's messages say, as values with their ages. NED, degrees and centimetres end here: ENU and SI inside.
 
-    east, north = y, x of NED        yaw = pi/2 - yaw of NED        yaw rate = -yaw rate of NED
+east, north = y, x of NED        yaw = pi/2 - yaw of NED        yaw rate = -yaw rate of NED
 """
 
 import math

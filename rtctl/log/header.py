@@ -15,7 +15,19 @@ import numpy as np
 from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
 
-PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet", "pymavlink")
+PACKAGES = (
+    "rtctl",
+    "numpy",
+    "numba",
+    "pin",
+    "coal",
+    "mcap",
+    "protobuf",
+    "zstandard",
+    "python-can",
+    "pybullet",
+    "pymavlink",
+)
 
 MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields

@@ -75,9 +75,7 @@ def looked(chart: Chart, x: F64, yaw: float, scan: F64, start: float, step: floa
 
 
 @njit(cache=True, fastmath=False)
-def _look(
-    cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float
-) -> None:
+def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float) -> None:
     count, turn = scan.shape[0], 2.0 * math.pi
     half = int(reach / CELL) + 1
     ci, cj = int(math.floor(x[0] / CELL)) - origin[0], int(math.floor(x[1] / CELL)) - origin[1]
@@ -136,22 +134,19 @@ def _free(cells: U8Grid, origin: I64, obstacles: Obstacles, height: float, field
                     d = CELL * math.sqrt(float((a - i) * (a - i) + (b - j) * (b - j)))
                     if d < field[a, b]:
                         field[a, b] = d
-    P, none, out = np.empty((3, SIZE)), np.zeros(SIZE), np.empty((1, 4, SIZE))
-    for k in range(obstacles.active.shape[0]):
-        if not obstacles.active[k]:
-            continue
-        one = Obstacles(
-            obstacles.kind[k : k + 1], obstacles.active[k : k + 1], obstacles.R[k : k + 1], obstacles.p[k : k + 1],
-            obstacles.v[k : k + 1], obstacles.w[k : k + 1], obstacles.dims[k : k + 1], obstacles.group[k : k + 1],
-        )  # fmt: skip
-        for i in range(SIZE):
+    slots = obstacles.active.shape[0]
+    told = np.flatnonzero(obstacles.active)
+    if told.shape[0] == 0:
+        return
+    P, none, out = np.empty((3, SIZE)), np.zeros(SIZE), np.empty((slots, 4, SIZE))
+    for i in range(SIZE):
+        for j in range(SIZE):
+            P[0, j], P[1, j], P[2, j] = (origin[0] + i + 0.5) * CELL, (origin[1] + j + 0.5) * CELL, height
+        distances_into(P, none, obstacles, math.inf, out)
+        for k in told:
             for j in range(SIZE):
-                P[0, j], P[1, j] = (origin[0] + i + 0.5) * CELL, (origin[1] + j + 0.5) * CELL
-                P[2, j] = height
-            distances_into(P, none, one, math.inf, out)
-            for j in range(SIZE):
-                if out[0, 0, j] < field[i, j]:
-                    field[i, j] = max(out[0, 0, j], 0.0)
+                if out[k, 0, j] < field[i, j]:
+                    field[i, j] = max(out[k, 0, j], 0.0)
 
 
 def returns_near(chart: Chart, x: F64, reach: float) -> F64:

@@ -9,7 +9,9 @@ from rtctl.control.faults import Fault, latch_with
 from rtctl.types import I64, Link, Severity, State
 
 FAULTS = (
-    Fault("frames_refused", 58, Severity.LOG, "A", "frames came that are unsigned, forged, replayed or not the vehicle's"),
+    Fault(
+        "frames_refused", 58, Severity.LOG, "A", "frames came that are unsigned, forged, replayed or not the vehicle's"
+    ),
     Fault("heartbeat_late", 62, Severity.SS2, "A", "the vehicle's heartbeat is late"),
     Fault("heartbeat_lost", 62, Severity.SS1, "R", "the vehicle's heartbeat is gone"),
     Fault("rebooted", 63, Severity.SS1, "R", "the autopilot started anew"),

@@ -197,7 +197,9 @@ def unicycle(base: Base, v_ref: F64, yaw: float) -> tuple[float, float]:
     return ahead, min(max(w, -lim.w_max), lim.w_max)
 
 
-def allowed_speed(base: Base, x: F64, direction: F64, speed: float, seen: F64, obstacles: Obstacles, push: Push) -> float:
+def allowed_speed(
+    base: Base, x: F64, direction: F64, speed: float, seen: F64, obstacles: Obstacles, push: Push
+) -> float:
     """Return the speed [m/s], at most `speed`, that can be braked to rest before anything ahead.
 
     direction (2,): unit. Straight on, a circle of the hull's radius must not come nearer than `stop` to a return or a

@@ -45,7 +45,7 @@ def tick(
 
 def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
     """Return the memory before the first tick: IDLE, at rest where the feedback says the base is."""
-    table = world.with_static(world.empty(base.slots), base.obstacles)
+    table = world.with_static(world.empty(base.slots, base.meshes), base.obstacles)
     seen = chart.empty(feedback.position)
     far = np.full(base.slots, np.inf)
     return BaseMemory(

@@ -4,6 +4,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from rtctl.control.firas import FieldParams
+from rtctl.control.meshes import Meshes
 from rtctl.types import F64, Shape
 
 SECTORS = 72  # of a scan at most
@@ -81,6 +82,7 @@ class Base(NamedTuple):
     noise: Noise
     safety: SafetyParams
     obstacles: tuple[Shape, ...]  # of the config, always there
+    meshes: Meshes  # that obstacles may refer to
     reach: float  # [m] no goal further from where the autopilot's frame begins is taken
     tolerance: float  # [m] of a goal that gives none
     stall: float  # [s] without progress short of the goal before it is diagnosed

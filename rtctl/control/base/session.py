@@ -36,9 +36,7 @@ def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, in
     watched = active and not m.held
     taken = watched and m.entered and not f.ours
     taken = taken or (m.state == State.ARMED and m.entered and not f.ours)
-    failed = m.state == State.ARMED and (
-        f.word in REFUSALS or (m.tick - m.since) * base.dt >= base.engage
-    )
+    failed = m.state == State.ARMED and (f.word in REFUSALS or (m.tick - m.since) * base.dt >= base.engage)
     evidence = Evidence(
         active=active,
         engaged=watched and m.mine,
@@ -152,15 +150,22 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
         return m
     rho = m.goal_rho
     verdict = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
-    if not verdict and goal.task != Task.POSITION:
-        verdict = "goal: a base takes a position alone, got an orientation"
+    if not verdict and goal.task not in (Task.POSITION, Task.X | Task.Y):
+        verdict = "goal: a base takes a position alone, wanted x and y and no orientation"
     if not verdict:
         rho = goal_distance(base, m.world, goal)
         verdict = goals.refusal(goal, np.zeros(3), base.reach, rho, m.world.names)
     if verdict:
         return m._replace(verdict=verdict.replace("from the base", "from the origin").replace("arm's ", ""))
     return m._replace(
-        goal=goal, goal_rho=rho, status=Status.MOVING, blocker=-1, still=0, way=detour.NO_WAY, nearest=np.inf, due=m.tick
+        goal=goal,
+        goal_rho=rho,
+        status=Status.MOVING,
+        blocker=-1,
+        still=0,
+        way=detour.NO_WAY,
+        nearest=np.inf,
+        due=m.tick,
     )
 
 
