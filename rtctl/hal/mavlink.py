@@ -22,7 +22,6 @@ from rtctl.hal.mavlink_talk import Order, Talk, request, stream
 from rtctl.hal.mavlink_view import View, enu, local_of
 from rtctl.hal.wire import Address, Wire
 from rtctl.protocol import signing
-from rtctl.types import Link
 
 HEARTBEAT = 1.0  # [s] between ours
 TIMESYNC = 1.0  # [s]

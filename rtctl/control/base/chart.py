@@ -78,7 +78,7 @@ def looked(chart: Chart, x: F64, yaw: float, scan: F64, start: float, step: floa
 def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float) -> None:
     count, turn = scan.shape[0], 2.0 * math.pi
     half = int(reach / CELL) + 1
-    ci, cj = int(math.floor(x[0] / CELL)) - origin[0], int(math.floor(x[1] / CELL)) - origin[1]
+    ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
     for i in range(max(0, ci - half), min(SIZE, ci + half + 1)):
         for j in range(max(0, cj - half), min(SIZE, cj + half + 1)):
             if cells[i, j] == 0:
@@ -89,13 +89,13 @@ def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: floa
                 continue
             angle = math.atan2(dy, dx) - yaw - start
             wide = 0.7 * CELL / d  # every beam that touches the cell must have passed it
-            first = int(math.floor((angle - wide) / step + 0.5))
-            last = int(math.floor((angle + wide) / step + 0.5))
+            first = math.floor((angle - wide) / step + 0.5)
+            last = math.floor((angle + wide) / step + 0.5)
             if step < 0.0:
                 first, last = last, first
             passed = True
             for k in range(first, last + 1):
-                at = k % int(round(turn / abs(step)))
+                at = k % round(turn / abs(step))
                 if at >= count or scan[at] < d + 0.7 * CELL:
                     passed = False
             if passed:
@@ -105,8 +105,8 @@ def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: floa
         if d < 0.0 or d > reach:
             continue
         angle = yaw + start + k * step
-        i = int(math.floor((x[0] + d * math.cos(angle)) / CELL)) - origin[0]
-        j = int(math.floor((x[1] + d * math.sin(angle)) / CELL)) - origin[1]
+        i = math.floor((x[0] + d * math.cos(angle)) / CELL) - origin[0]
+        j = math.floor((x[1] + d * math.sin(angle)) / CELL) - origin[1]
         if 0 <= i < SIZE and 0 <= j < SIZE:
             cells[i, j] = SURE
 
@@ -114,7 +114,8 @@ def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: floa
 def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
     """Return the distance (SIZE, SIZE) [m] of each cell's centre to the nearest return or told obstacle.
 
-    Beyond STENCIL cells it is that many: nobody asks how much further. height [m] is where the told obstacles, which are solids, are cut.
+    Beyond STENCIL cells it is that many: nobody asks how much further. height [m] is where the told obstacles, which
+    are solids, are cut.
     """
     field = np.empty((SIZE, SIZE))
     _free(chart.cells, chart.origin, obstacles, height, field)
@@ -157,7 +158,7 @@ def returns_near(chart: Chart, x: F64, reach: float) -> F64:
 @njit(cache=True, fastmath=False)
 def _near(cells: U8Grid, origin: I64, x: F64, reach: float) -> F64:
     half = int(reach / CELL) + 1
-    ci, cj = int(math.floor(x[0] / CELL)) - origin[0], int(math.floor(x[1] / CELL)) - origin[1]
+    ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
     found, m = np.empty(((2 * half + 1) ** 2, 2)), 0
     for i in range(max(0, ci - half), min(SIZE, ci + half + 1)):
         for j in range(max(0, cj - half), min(SIZE, cj + half + 1)):

@@ -86,8 +86,8 @@ def _clear(free: F64, origin: I64, ax: float, ay: float, bx: float, by: float, r
     inside = True
     while True:
         t = s / length if length > 0.0 else 0.0
-        i = int(math.floor((ax + t * (bx - ax)) / CELL)) - origin[0]
-        j = int(math.floor((ay + t * (by - ay)) / CELL)) - origin[1]
+        i = math.floor((ax + t * (bx - ax)) / CELL) - origin[0]
+        j = math.floor((ay + t * (by - ay)) / CELL) - origin[1]
         if not (0 <= i < SIZE and 0 <= j < SIZE):
             return True  # beyond the window nothing is known
         d = free[i, j]
@@ -106,8 +106,8 @@ def _search(free: F64, origin: I64, x: F64, goal: F64, room: float) -> tuple[F64
     """A* over cells, then the string pulled taut: (corners (CORNERS, 2), their number, distance short of the goal)."""
     n = SIZE * SIZE
     cost, parent, closed = np.full(n, math.inf), np.full(n, -1, np.int64), np.zeros(n, np.bool_)
-    si = min(max(int(math.floor(x[0] / CELL)) - origin[0], 0), SIZE - 1)
-    sj = min(max(int(math.floor(x[1] / CELL)) - origin[1], 0), SIZE - 1)
+    si = min(max(math.floor(x[0] / CELL) - origin[0], 0), SIZE - 1)
+    sj = min(max(math.floor(x[1] / CELL) - origin[1], 0), SIZE - 1)
     gi, gj = goal[0] / CELL - origin[0] - 0.5, goal[1] / CELL - origin[1] - 0.5
     outside = not (0.0 <= gi <= SIZE - 1.0 and 0.0 <= gj <= SIZE - 1.0)
     begin = si * SIZE + sj

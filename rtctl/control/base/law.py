@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rtctl.control.base.robot import Base, Wheels
+from rtctl.control.base.robot import Base
 from rtctl.control.firas import firas
 from rtctl.control.primitives import Obstacles, distances_into
 from rtctl.types import F64
