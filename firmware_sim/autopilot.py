@@ -14,6 +14,7 @@ GUIDED, HOLD, MANUAL = 15, 4, 0  # custom modes of ArduPilot Rover
 OFFBOARD, LOITER, PX4_MANUAL = 6 << 16, 4 << 16 | 3 << 24, 1 << 16
 SCHEDULER_HZ = 40.0  # the fastest stream of a 50 Hz scheduler
 STREAMS = {32: "local", 30: "attitude", 331: "odometry", 193: "ekf", 230: "estimator", 330: "obstacles", 49: "origin"}
+EPOCH = 1.79e9  # [s] Unix time when the simulation begins; in real time it is what the clock says
 COAST = 3.0  # [s] that ArduPilot goes on with the last set-point
 GCS_SILENCE = 5.7  # [s] until the GCS failsafe holds, when it is on
 ORIGIN = (-35.363262, 149.165237)  # [deg] of local (0, 0)
@@ -45,6 +46,7 @@ class Autopilot:
         self.resets = 0
         self.estimator_bad = self.arming_refused = self.silent = self.mute = self.blind = False
         self.aborted = ""  # why it died
+        self.epoch = EPOCH
         self.stick: tuple[float, float] | None = None  # [m/s, rad/s] a person drives
         self.scan: list[float] = []  # [m] of the range sensor, and whether it is new
         self.scan_new = False
@@ -227,7 +229,7 @@ class Autopilot:
         self.vehicle.step(v, side, w, dt)
         self._emit()
         out, self.outbox = self.outbox, []
-        unix = 1.79e9 + self.time
+        unix = self.epoch + self.time
         return [] if self.silent else [self.end.pack(m, unix) for m in out]
 
     def _failsafes(self) -> None:

@@ -181,6 +181,7 @@ class Server:
 
     def __init__(self, rover: Rover, report: str | None) -> None:
         self.rover, self.report = rover, report
+        rover.autopilot.epoch = time.time() - rover.autopilot.time
         self.stop = False
         self.least: dict[str, float] = {}
         self.track: list[list[float]] = []

@@ -29,11 +29,12 @@ LINK = "vehicle"  # the link's name in the log
 MAV_TX, MAV_RX = int(Kind.MAV_TX), int(Kind.MAV_RX)
 FAREWELL = 3.0  # [s] of zero twist at most, when a turn raised
 STILL = 0.1  # [m/s]
+EPOCH = 1_790_000_000 * 10**9  # [ns] Unix time at which simulations begin
 ANGLE_TOLERANCE = 3.2  # [rad] a base's goals have no orientation
 
 
 def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLink:
-    """Return the opened link of a checked config; `wire` replaces the config's url. Raises RtctlError."""
+    """Return the opened link of a checked config; a simulator's `wire` replaces its url and clock. Raises RtctlError."""
     c = config.link
     key = key_of(config, path)
     state = None if c.state_file is None else Path(c.state_file)
@@ -49,8 +50,10 @@ def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLi
         timeout=c.handshake_s,
         scan=config.avoid.scan == "required",
     )
-    keys = Keys(key, state, c.signing_link_id)
-    return MavLink(spec, open_wire(c.url) if wire is None else wire, keys)
+    if wire is None:
+        return MavLink(spec, open_wire(c.url), Keys(key, state, c.signing_link_id))
+    simulated = wire
+    return MavLink(spec, wire, Keys(key, state, c.signing_link_id, lambda: EPOCH + round(1e9 * simulated.now())))
 
 
 def machine_of(link: MavLink) -> Machine:

@@ -1,5 +1,7 @@
 """Rows 58 to 69 of the fault catalogue on the rover: each fault by name, what is done about it, and how it ends."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,8 @@ def setpoints(packets: list[bytes]) -> list[bytes]:
 
 
 def test_every_fault_of_the_base_has_a_test_that_names_it():
-    text = "".join(open(f"tests/{name}.py").read() for name in ("test_base_faults", "test_base_link", "test_base_law"))
+    here = Path(__file__).parent
+    text = "".join((here / f"test_base_{name}.py").read_text() for name in ("faults", "link", "law"))
     assert [f.name for f in faults.FAULTS if f'"{f.name}"' not in text] == []
     assert len({f.name for f in faults.FAULTS}) == len(faults.FAULTS) < 64
 

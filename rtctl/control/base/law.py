@@ -19,6 +19,7 @@ from rtctl.control.firas import firas
 from rtctl.control.primitives import Obstacles, distances_into
 from rtctl.types import F64
 
+RESERVE = 0.4  # of the lag, for a vehicle that answers later than its config says
 HORIZON = 30.0  # [m] that the governor looks ahead
 CREEP = 0.3  # [m/s] at which a car that cannot turn on the spot comes round
 
@@ -198,22 +199,24 @@ def unicycle(base: Base, v_ref: F64, yaw: float) -> tuple[float, float]:
 
 
 def allowed_speed(
-    base: Base, x: F64, direction: F64, speed: float, seen: F64, obstacles: Obstacles, push: Push
+    base: Base, x: F64, direction: F64, coming: float, seen: F64, obstacles: Obstacles, push: Push
 ) -> float:
-    """Return the speed [m/s], at most `speed`, that can be braked to rest before anything ahead.
+    """Return the speed [m/s] that can be braked to rest before anything ahead; at most V_max.
 
-    direction (2,): unit. Straight on, a circle of the hull's radius must not come nearer than `stop` to a return or a
-    told obstacle; one that moves is met with its own speed taken off what may be spent.
+    direction (2,): unit. coming [m]: the way that what was sent will still take. Straight on, a circle of the hull's
+    radius must not come nearer than `stop` to a return or a told obstacle; one that moves is met with its own speed
+    taken off what may be spent.
     """
     m = base.margins
     r = m.hull + m.stop
     gap = _gap_seen(x, direction, r, seen)
     gap = min(gap, _gap_told(x, direction, r, m.height, obstacles, HORIZON))
-    v = min(speed, spend(gap, m.brake, m.lag))
+    coming = max(coming, 0.0)
+    v = min(base.limits.v_max, spend(gap - coming, m.brake, RESERVE * m.lag))
     for k in np.flatnonzero(push.closing > 0.0):
         towards = -float(push.normal[k] @ direction)
         if towards > 0.05:
-            left = spend(float(push.rho[k]) - m.stop, m.brake, m.lag) - float(push.closing[k])
+            left = spend(float(push.rho[k]) - m.stop - towards * coming, m.brake, m.lag) - float(push.closing[k])
             v = min(v, max(left, 0.0) / towards)
     return v
 

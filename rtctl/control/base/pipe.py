@@ -154,7 +154,8 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     if base.wheels != Wheels.HOLONOMIC and not base.world_velocity:
         sign = 1.0 if law.unicycle(base, v_ref, yaw)[0] >= 0.0 else -1.0
         direction = sign * np.array([math.cos(yaw), math.sin(yaw)])
-    allowed = law.allowed_speed(base, m.here.x, direction, base.limits.v_max, seen, m.world.obstacles, push)
+    coming = float((x - m.here.x) @ direction)
+    allowed = law.allowed_speed(base, m.here.x, direction, coming, seen, m.world.obstacles, push)
     m = m._replace(rho=push.rho, rho_seen=push.rho_seen)
     return m, (v_ref, push, xd_d, allowed)
 
