@@ -94,8 +94,8 @@ def _schema(arguments: argparse.Namespace) -> int:
 def _schema_of(what: str) -> dict[str, Any]:
     from rtctl import config
 
-    if what == "config":
-        return config.json_schema()
+    if what in ("config", "base"):
+        return config.json_schema(config.Config if what == "config" else config.BaseConfig)
     import msgspec
 
     from rtctl.config.scenario import Scenario
