@@ -34,7 +34,7 @@ ANGLE_TOLERANCE = 3.2  # [rad] a base's goals have no orientation
 
 
 def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLink:
-    """Return the opened link of a checked config; a simulator's `wire` replaces its url and clock. Raises RtctlError."""
+    """Return the opened link of a checked config; a simulator's `wire` brings its own clock. Raises RtctlError."""
     c = config.link
     key = key_of(config, path)
     state = None if c.state_file is None else Path(c.state_file)
@@ -162,20 +162,16 @@ def fallback(servo: Servo, sink: Sink, slots: Iterator[Slot]) -> None:
         sink.put_many(MAV_TX, link.write(command), time.monotonic_ns())
 
 
-def farewell(link: MavLink, base: Base, sink: Sink, mine: bool) -> None:
+def farewell(servo: Servo, sink: Sink) -> None:
     """End with zero twist and the vehicle's own hold mode while the mode is ours, then disarm what we armed."""
-    asks = [Ask.HOLD] * round(1.0 / base.dt) + ([Ask.DISARM] * round(1.0 / base.dt) if mine else [])
-    done = {Ask.HOLD: lambda f: not f.ours, Ask.DISARM: lambda f: not f.armed}
+    m: Any = servo.memory
+    link: Any = servo.link
+    mine, period = bool(m.mine) and m.state != State.IDLE, servo.robot.dt
+    asks = [Ask.HOLD] * round(1.0 / period) + ([Ask.DISARM] * round(1.0 / period) if mine else [])
     for ask in asks:
-        f = link.read(-1, 0, 0.0, 0.0)
+        f: BaseFeedback = link.read(-1, 0, 0.0, 0.0)
         sink.put_many(MAV_RX, link.received, time.monotonic_ns())
-        if not done[ask](f):
+        if f.ours if ask == Ask.HOLD else f.armed:
             command = BaseCommand(ask, 0.0, 0.0, np.zeros(2))
             sink.put_many(MAV_TX, link.write(command), time.monotonic_ns())
-            time.sleep(base.dt)
-
-
-def is_mine(servo: Servo) -> bool:
-    """Return whether the vehicle was armed by us and nobody took it since."""
-    m: Any = servo.memory
-    return bool(m.mine) and m.state != State.IDLE
+            time.sleep(period)

@@ -161,7 +161,7 @@ def _family(path: Path, lockstep: bool) -> Family:
         header=base.header_of,
         status=lambda servo, recorder: base.status(servo, _log_status(recorder)),
         fallback=lambda servo, recorder, slots, lockstep: base.fallback(servo, recorder, slots),
-        farewell=lambda servo, recorder: base.farewell(servo.link, servo.robot, recorder, base.is_mine(servo)),
+        farewell=lambda servo, recorder: base.farewell(servo, recorder),
         names=base_faults.names,
     )
 

@@ -139,19 +139,21 @@ class Relay:
 
 def some_world(seed: int, size: float = 14.0, solids: int = 10) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
     """Return ten random discs and boxes around the origin, and 20 places that are free."""
-    random, tables = np.random.default_rng(seed), []
+    random = np.random.default_rng(seed)
+    tables: list[dict[str, Any]] = []
     while len(tables) < solids:
         x, y = random.uniform(-size, size, 2)
         if np.hypot(x, y) < 4.5:
             continue
-        place = {"name": f"o{len(tables)}", "position_m": [float(x), float(y), 0.0]}
+        place: dict[str, Any] = {"name": f"o{len(tables)}", "position_m": [float(x), float(y), 0.0]}
         if random.random() < 0.5:
             place |= {"type": "cylinder", "radius_m": float(random.uniform(0.4, 1.5)), "length_m": 2.0}
         else:
             a, b, yaw = random.uniform((0.8, 0.8, 0.0), (4.0, 2.0, np.pi))
             place |= {"type": "box", "size_m": [float(a), float(b), 2.0], "rpy_rad": [0.0, 0.0, float(yaw)]}
         tables.append(place)
-    there, places = plane.solids_at(tables, 0.0), []
+    there = plane.solids_at(tables, 0.0)
+    places: list[np.ndarray] = []
     while len(places) < 20:
         at = random.uniform(-size, size, 2)
         near = places[-1] if places else np.zeros(2)

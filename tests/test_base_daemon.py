@@ -27,7 +27,8 @@ class Pair:
     def __init__(self, folder):
         self.folder, self.console, self.report = folder, str(folder / "console" / "s"), folder / "report.json"
         text = ROVER.read_text().replace("127.0.0.1:14550", f"127.0.0.1:{free_port()}")
-        text = text.replace('directory = "logs"', f'directory = "{folder / "logs"}"').replace("disk_floor_MB = 500.0", "disk_floor_MB = 1.0")  # fmt: skip
+        text = text.replace('directory = "logs"', f'directory = "{folder / "logs"}"')
+        text = text.replace("disk_floor_MB = 500.0", "disk_floor_MB = 1.0")
         self.config = folder / "rover.toml"
         self.config.write_text(text + f'\n[console]\nsocket = "{self.console}"\n')
         self.processes = []

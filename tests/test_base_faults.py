@@ -10,7 +10,7 @@ from firmware_sim.rover import KINDS
 from rtctl.control.base import faults
 from rtctl.control.base.signals import Ask
 from rtctl.types import State, Status, Verb
-from tests.base_lab import ROVER_PX4, BaseLab
+from tests.base_lab import ROVER, ROVER_PX4, BaseLab
 
 DRIVING = 3.0  # [s] of the double's clock at which faults come: arming takes less than one
 
@@ -132,10 +132,10 @@ def test_estimator_bad_brakes_and_latches():
     assert not lab.m.verdict
 
 
-@pytest.mark.parametrize("config", [None, ROVER_PX4])
+@pytest.mark.parametrize("config", [ROVER, ROVER_PX4])
 def test_a_position_jump_stops_and_what_was_seen_jumps_along(config):
     disc = {"name": "disc", "type": "cylinder", "radius_m": 1.0, "length_m": 2.0, "position_m": [9.0, 4.0, 0.0]}
-    lab = BaseLab(*([config] if config else []), obstacles=[disc], inject=["ekf_reset@3.0"]).driving(seconds=1.0)
+    lab = BaseLab(config, obstacles=[disc], inject=["ekf_reset@3.0"]).driving(seconds=1.0)
     assert lab.run(4.0, lambda: "position_jump" in lab.faults)
     assert lab.m.state == State.SAFE_STOP
     lab.run(1.0)
@@ -166,9 +166,9 @@ def test_scan_stale_holds_and_goes_on_when_it_is_back():
     assert lab.speed > 1.5
 
 
-@pytest.mark.parametrize(("config", "bound"), [(None, 5.5), (ROVER_PX4, 3.5)])
+@pytest.mark.parametrize(("config", "bound"), [(ROVER, 5.5), (ROVER_PX4, 3.5)])
 def test_when_our_setpoints_stop_the_autopilot_stops_by_itself(config, bound):
-    lab = BaseLab(*([config] if config else [])).driving(seconds=3.5)
+    lab = BaseLab(config).driving(seconds=3.5)
     assert lab.speed > 1.5
     for _ in range(round(bound / lab.base.dt)):  # killed: nothing is said any more
         lab.rover.exchange([])

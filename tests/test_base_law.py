@@ -1,6 +1,7 @@
 """The base's mathematics, each against an oracle of its own, and the tick as a whole: pure, warm, replayed."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -73,7 +74,8 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
     assert not seen.cells.any()
     kept = charted([[10.0, 3.0]])
     away = chart.moved(kept, np.array([25.0, 0.0]))
-    np.testing.assert_allclose(chart.returns_near(away, np.array([10.0, 3.0]), 1.0), chart.returns_near(kept, np.array([10.0, 3.0]), 1.0))  # fmt: skip
+    before, after = (chart.returns_near(c, np.array([10.0, 3.0]), 1.0) for c in (kept, away))
+    np.testing.assert_allclose(after, before)
     assert chart.moved(kept, np.array([200.0, 0.0])).cells.sum() == 0
 
 
@@ -88,7 +90,7 @@ def test_the_way_is_as_short_as_brute_force_over_the_cells_finds_and_keeps_its_r
     assert way.length <= shortest + 0.5 * CELL  # pulled taut it is shorter than steps along cells
     assert way.length >= 0.92 * shortest
     corners = np.vstack([x, way.corners])
-    for a, b in zip(corners, corners[1:], strict=False):
+    for a, b in pairwise(corners):
         on = a + (b - a) * np.linspace(0.0, 1.0, 200)[:, None]
         cells = np.floor(on / CELL).astype(int) - seen.origin
         assert free[cells[:, 0], cells[:, 1]].min() >= room - 0.2 * CELL  # a line may cut the corner of a cell
@@ -293,7 +295,7 @@ def test_a_log_replays_to_the_same_bytes_and_nothing_compiles_after_warm(tmp_pat
     from rtctl.base import header_of
 
     pipe.warm(BASE)
-    compiled = []
+    compiled: list[str] = []
     disc = {"name": "d", "type": "cylinder", "radius_m": 1.0, "length_m": 2.0, "position_m": [8.0, 0.2, 0.0]}
     probe = BaseLab(obstacles=[disc])
     sink = McapSink(tmp_path / "run.mcap", header_of(probe.config, ROVER, probe.base, probe.start))

@@ -133,7 +133,9 @@ def test_no_bytes_make_it_raise_and_none_are_good(chunks):
             assert after is state
 
 
-@given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.binary(max_size=5).filter(lambda b: not b.strip(b"\0")))
+@given(
+    st.lists(st.integers(1, 30), min_size=1, max_size=12), st.binary(max_size=5).filter(lambda b: not b.strip(b"\0"))
+)
 def test_frames_are_cut_alike_however_the_bytes_are_split(sizes, noise):
     data = noise + b"".join(signed(NOW + k).raw for k in range(3))
     rest, found, at = b"", [], 0

@@ -101,7 +101,8 @@ def _returns(x: F64, yaw: float, f: BaseFeedback, reach: float) -> F64:
     """Return the points (m, 2) [m] that a scan taken at x (2,), yaw touched."""
     hit = (f.scan >= 0.0) & (f.scan <= reach)
     angle = yaw + f.scan_start + f.scan_step * np.flatnonzero(hit)
-    return x + f.scan[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points: F64 = x + f.scan[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return points
 
 
 def _surroundings(m: BaseMemory, f: BaseFeedback) -> tuple[F64, int]:
