@@ -17,6 +17,7 @@ from rtctl.config.base_derive import build
 from rtctl.control import world
 from rtctl.control.base import chart, detour, estimate, faults, law, pipe
 from rtctl.control.base.chart import CELL, SIZE, STENCIL
+from rtctl.control.base.record import feedback_from
 from rtctl.control.base.robot import SECTORS, Wheels
 from rtctl.control.base.signals import Ask, BaseFeedback, at_rest
 from rtctl.log import read
@@ -308,7 +309,7 @@ def test_a_log_replays_to_the_same_bytes_and_nothing_compiles_after_warm(tmp_pat
     rows = log["/tick"].array
     m = pipe.initial(lab.base, lab.start)
     for k, row in enumerate(rows):
-        m, _, record = pipe.tick(lab.base, m, _fed(row), requests.get(k, Request()))
+        m, _, record = pipe.tick(lab.base, m, feedback_from(row), requests.get(k, Request()))
         assert record.tobytes() == row.tobytes(), k
     assert len(rows) > 300
 
@@ -322,13 +323,3 @@ class _Listener(event.Listener):
 
     def on_end(self, e):
         pass
-
-
-def _fed(row) -> BaseFeedback:
-    """Return the feedback that a record was made from."""
-    values = {}
-    for name in BaseFeedback._fields:
-        value = row[name]
-        kind = BaseFeedback.__annotations__[name]
-        values[name] = np.array(value) if value.shape else {int: int, bool: bool, float: float}[kind](value)
-    return BaseFeedback(**values)

@@ -346,6 +346,23 @@ def test_frames_refused_is_a_fault_that_disturbs_nothing_and_a_signed_link_takes
     assert lab.run(2.0, lambda: not lab.faults)
 
 
+def test_no_bytes_make_the_link_raise_or_believe_a_number_that_is_none():
+    lab = BaseLab().armed()
+    random = np.random.default_rng(9)
+    for k in range(400):
+        data = bytearray(random.bytes(int(random.integers(0, 60))))
+        if k % 2 and lab.link.received:
+            data = bytearray(lab.link.received[int(random.integers(len(lab.link.received)))])
+            data[int(random.integers(len(data)))] ^= int(random.integers(1, 256))
+        if k % 5 == 0:  # whole, of the vehicle, and nonsense: every float of it NaN
+            data = bytearray(theirs("LOCAL_POSITION_NED", time_boot_ms=100_000 + k, x=math.nan, vx=math.inf))
+            data += theirs("ATTITUDE", time_boot_ms=100_000 + k, yaw=math.nan)
+        lab.link.wire._waiting.append(bytes(data))
+        lab.tick()
+        f = lab.m.last
+        assert np.isfinite([*f.position, *f.velocity, f.yaw, f.yaw_rate]).all()
+
+
 def test_udp_is_pinned_to_the_vehicle_and_deaf_to_strangers():
     wire = Udp("127.0.0.1", 0, True)
     port = wire._socket.getsockname()

@@ -101,8 +101,8 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
                 Sample(minute, sent / STEP, _resident(), waiting, goals - done, 1e3 * float(np.percentile(times, 99)))
             )
             s = samples[-1]
-            print(f"{minute:3d} min  {s.setpoints:6.2f} Hz  {s.memory:7.1f} MB  {s.queue:3d} waiting  {s.goals:2d} goals  "
-                  f"turn p99 {s.compute:5.2f} ms", flush=True)  # fmt: skip
+            told = f"{s.setpoints:6.2f} Hz  {s.memory:7.1f} MB  {s.queue:3d} waiting  {s.goals:2d} goals"
+            print(f"{minute:3d} min  {told}  turn p99 {s.compute:5.2f} ms", flush=True)
             sent, times = 0, []
         if realtime:
             time.sleep(max(0.0, begun + (slot + 1) * base.dt - time.monotonic()))

@@ -7,6 +7,7 @@ import numpy as np
 
 from rtctl.control.base.detour import CORNERS
 from rtctl.control.base.robot import SECTORS
+from rtctl.control.base.signals import BaseFeedback
 from rtctl.types import Record
 
 
@@ -42,3 +43,13 @@ def make_base_record(slots: int, **values: Any) -> Record:
         record[name] = value
     record.flags.writeable = False
     return record
+
+
+def feedback_from(row: Any) -> BaseFeedback:
+    """Return the feedback that a record was made from: with the requests of the log all that a replay needs."""
+    kinds = {int: int, bool: bool, float: float}
+    values = {}
+    for name, kind in BaseFeedback.__annotations__.items():
+        value = row[name]
+        values[name] = np.array(value) if value.shape else kinds[kind](value)
+    return BaseFeedback(**values)
