@@ -60,7 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     queue = max(s.queue for s in samples)
     print(
         f"set-points {min(rates):.2f} to {max(rates):.2f} Hz, memory {before:.1f} then {after:.1f} MB, "
-        f"at most {queue} waiting, {sum(s.goals for s in samples)} goals, {contacts} contacts, faults: {faults or 'none'}"
+        f"at most {queue} waiting, {sum(s.goals for s in samples)} goals, {contacts} contacts, "
+        f"faults: {', '.join(faults) or 'none'}"
     )
     steady = max(rates) - min(rates) < 0.05 and abs(after - before) < GROWTH and queue < 40
     return 0 if steady and not contacts and not faults else 1

@@ -48,7 +48,7 @@ def make_base_record(slots: int, **values: Any) -> Record:
 def feedback_from(row: Any) -> BaseFeedback:
     """Return the feedback that a record was made from: with the requests of the log all that a replay needs."""
     kinds = {int: int, bool: bool, float: float}
-    values = {}
+    values: dict[str, Any] = {}
     for name, kind in BaseFeedback.__annotations__.items():
         value = row[name]
         values[name] = np.array(value) if value.shape else kinds[kind](value)
