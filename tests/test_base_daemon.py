@@ -77,7 +77,7 @@ def test_a_base_is_armed_driven_by_metres_and_degrees_and_let_go_at_rest(tmp_pat
         pair.ask("arm")
         pair.until(lambda s: s["state"] == "RUN")
         options = ["--socket", pair.console, "--wait", "--json"]
-        assert cli.main(["goal", "3", "0.5", *options]) == EXIT_OK
+        assert cli.main(["goal", "3", "0.5", "0", *options]) == EXIT_OK
         assert cli.main(["goal", "--latlon", "-35.363262", "149.165281", *options]) == EXIT_OK  # 4 m east of the origin
         for line in capsys.readouterr().out.splitlines():
             assert json.loads(line)["arrived"]

@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
     goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
         goal.add_argument(
-            axis, metavar=axis.upper(), type=number, nargs="?", help="in the world frame [m]; a base's Z is 0"
+            axis, metavar=axis.upper(), type=number, nargs="?", help="in the world frame [m]; of a base Z means nothing"
         )
     goal.add_argument("--latlon", metavar=("LAT", "LON"), nargs=2, type=number, help="of a base instead of X Y [deg]")
     turn = goal.add_mutually_exclusive_group()
@@ -197,9 +197,9 @@ def _place(arguments: argparse.Namespace) -> dict[str, Any]:
         if arguments.x is not None:
             raise UsageError("goal: got X Y and --latlon, wanted one of them")
         return {"latlon_deg": arguments.latlon}
-    if arguments.y is None:
-        raise UsageError("goal: wanted X Y Z, for a base X Y, or --latlon LAT LON")
-    return {"position_m": [arguments.x, arguments.y, 0.0 if arguments.z is None else arguments.z]}
+    if arguments.z is None:  # also of a base: a Z forgotten must not send an arm to the floor
+        raise UsageError("goal: wanted X Y Z, or --latlon LAT LON")
+    return {"position_m": [arguments.x, arguments.y, arguments.z]}
 
 
 def _goals(arguments: argparse.Namespace) -> int:

@@ -133,7 +133,10 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
     Raises ValueError, TypeError or KeyError on anything else.
     """
     fields = [(str(f[0]), str(f[1]), tuple(f[2])) if len(f) > 2 else (str(f[0]), str(f[1])) for f in json.loads(text)]
-    dtype = np.dtype(fields)
+    try:
+        dtype = np.dtype(fields)
+    except SyntaxError as error:  # numpy evaluates what stands between commas
+        raise ValueError(f"no format of numpy: {error}") from None
     if unknown := {f.base.str for f in (dtype[name] for name in dtype.names or ())} - FIXED:
         raise ValueError(f"types {sorted(unknown)}, wanted some of {sorted(FIXED)}")
     return dtype
