@@ -8,7 +8,7 @@ import pytest
 
 from rtctl.sim import simulate
 from rtctl.types import ObstacleEdit, Shape, State, Status
-from tests.base_lab import CONFIGS, UPRIGHT, BaseLab, Relay, some_world
+from tests.base_lab import CONFIGS, ROVER, ROVER_PX4, UPRIGHT, BaseLab, Relay, some_world
 
 # time to goal [s] that an autopilot's own avoidance needed in the same world (ArduPilot BendyRuler at 2 m/s)
 WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}
@@ -61,6 +61,28 @@ def test_what_moves_across_or_towards_it_is_not_touched(start, velocity):
     lab = BaseLab(obstacles=[moving]).armed()
     assert lab.arrive(25.0, 0.0)
     assert lab.rover.truth().contacts == 0
+    assert lab.seen == ()
+
+
+@pytest.mark.parametrize(
+    ("config", "edits"),
+    [
+        (ROVER_PX4, []),
+        (ROVER_PX4, [('"skid"', '"holonomic"')]),
+        (ROVER, [('"skid"', '"ackermann"\nturn_radius_m = 1.5'), ("reverse = false", "reverse = true")]),
+    ],
+    ids=["px4", "holonomic", "car"],
+)
+def test_other_wheels_and_the_other_autopilot_get_through_as_well(config, edits, tmp_path):
+    text = config.read_text()
+    for old, new in edits:
+        text = text.replace(old, new)
+    (tmp_path / "base.toml").write_text(text)
+    solids, places = some_world(4)
+    lab = BaseLab(tmp_path / "base.toml", obstacles=solids).armed()
+    assert [lab.arrive(*at) for at in places[:3]] == [True] * 3
+    assert lab.rover.truth().contacts == 0
+    assert lab.least > 0.4
     assert lab.seen == ()
 
 

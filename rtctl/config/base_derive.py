@@ -113,11 +113,20 @@ def report(c: BaseConfig, base: Base) -> Report:
         _row("room of a way", m.room, "m", "free distance of its cells' centres: hull, clearance, half a cell"),
         _row("gap that is passed", 2.0 * m.room, "m", "narrower ones are walls"),
         _row("range", base.sense, "m", "of the scan that is believed"),
+        _row("reverse", int(base.limits.reverse), "", _ways(base), base.limits.reverse or base.limits.radius == 0.0),
         _row("scan", int(base.safety.scan), "", "required" if base.safety.scan else
              "off: only what is told is avoided", base.safety.scan),
         _row("reach", base.reach, "m", "no goal further from the origin is taken"),
     ]  # fmt: skip
     return Report(base.name, tuple(rows))
+
+
+def _ways(base: Base) -> str:
+    if base.limits.reverse:
+        return "it may drive backwards"
+    if base.limits.radius > 0.0:
+        return "off: a car that cannot turn on the spot stays before an obstacle it faces closely"
+    return "off: it turns on the spot"
 
 
 def _row(name: str, value: float, unit: str, note: str, fine: bool = True) -> Row:
