@@ -134,8 +134,8 @@ CASES = {
         said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 5), said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 4)
     ),
     "torque_mismatch": Case(off_torque(3.0, 6), off_torque(0.5, 20)),
-    "encoder_stuck": Case(said(*[{"qd": joint(2, 0.5)}] * 25), said(*[{"qd": joint(2, 0.04)}] * 150)),
-    "velocity_mismatch": Case(said(*[{"qd": joint(2, 1.5)}] * 25), said(*[{"qd": joint(2, 0.1)}] * 40)),
+    "encoder_stuck": Case(said(*[{"qd": joint(2, 0.5)}] * 25), said(*[{"qd": joint(2, 0.04)}] * 28)),
+    "velocity_mismatch": Case(said(*[{"qd": joint(2, 1.5)}] * 25), said(*[{"qd": joint(2, 0.1)}] * 13)),
     "encoder_jump": Case(jumps(0.3, 0.3), jumps(0.003, 0.0, 0.3, 0.0, 0.003, 0.0)),
     "not_finite": Case(said({"qd": joint(3, np.nan)})),
     "deadline": Case(said(*[{"missed": 1}] * 3), said({"missed": 1}, {"missed": 1}, {}, {"missed": 9})),
