@@ -20,6 +20,7 @@ from rtctl.config.base import is_base
 from rtctl.control import faults, task
 from rtctl.control.limits import permit, slew_reference
 from rtctl.control.pipe import warm
+from rtctl.control.primitives import MESH
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import quat_of
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
@@ -33,7 +34,7 @@ from rtctl.hal.recorder import Recorder
 from rtctl.hal.service import InstanceLock, Service, bus_resource
 from rtctl.hal.transport import open_transport
 from rtctl.log.header import Header
-from rtctl.servo import ARM, CAN_RX, CAN_TX, Machine, Servo, blocker_name, first_feedback
+from rtctl.servo import ARM, CAN_RX, CAN_TX, Machine, Servo, first_feedback
 from rtctl.types import Command, Drive, Feedback, Link, State, Verb
 
 LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
@@ -110,7 +111,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         start = family.greet(config, link, lockstep)
         recorder = _recorder(config, family.header(config, path, robot, start))
         servo = Servo(robot, link, recorder, np.zeros(0), dry, machine=family.machine(link), start=start)
-        console.publish(lambda: family.status(servo, recorder))
+        console.publish(lambda: family.status(servo, recorder), lambda: world(servo))
         if not lockstep:
             granted = clock.realtime(
                 config.loop.realtime, -1 if config.loop.cpu is None else config.loop.cpu, config.loop.priority
@@ -293,7 +294,7 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "robot": robot.name,
         "state": m.state.name,
         "status": m.status.name.lower(),
-        "detail": blocker_name(robot, m),
+        "detail": "; ".join(m.held),
         "tick": m.tick,
         "time_s": servo.now,
         "q_rad": m.joints.q,
@@ -314,6 +315,19 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "faults": list(faults.names(m.in_force)),
         "log": _log_status(recorder),
     }
+
+
+def world(servo: Servo) -> dict[str, Any]:
+    """Return the obstacles as the controller has them now: the active slots of `primitives.Obstacles`.
+
+    A mesh is told by its name, the points of a cloud not at all: they would not fit an answer.
+    """
+    known = servo.memory.world
+    slots = np.flatnonzero(known.obstacles.active)
+    rows = {key: getattr(known.obstacles, key)[slots] for key in ("kind", "R", "p", "v", "w", "dims", "margin")}
+    starts = dict(zip(known.known.starts, known.known.names, strict=True))
+    meshes = [starts[int(d[3])] if kind == MESH else "" for kind, d in zip(rows["kind"], rows["dims"], strict=True)]
+    return {"names": [known.names[k] for k in slots], "meshes": meshes, "obstacles": rows}
 
 
 def _log_status(recorder: Recorder) -> dict[str, Any]:

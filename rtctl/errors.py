@@ -46,3 +46,7 @@ class UsageError(RtctlError):
 
 class LogError(RtctlError):
     """A log cannot be opened, written, or does not hold what is asked of it."""
+
+
+class PlanError(RtctlError):
+    """The planner found no way: none exists, or it did not find it within its bounds."""

@@ -147,8 +147,8 @@ def _news(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> li
         news.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
     if after.state != before.state:
         news.append(("state", after.state.name))
-    if (after.status, after.blocker) != (before.status, before.blocker) and after.status != Status.NO_GOAL:
-        news.append((after.status.name.lower(), blocker_name(robot, after)))
+    if (after.status, after.holders) != (before.status, before.holders) and after.status != Status.NO_GOAL:
+        news.append((after.status.name.lower(), "; ".join(after.held)))
     return news
 
 
@@ -160,14 +160,3 @@ ARM = Machine(
     rx=CAN_RX,
     tx=CAN_TX,
 )
-
-
-def blocker_name(robot: Robot, m: Memory) -> str:
-    """Return the name of the obstacle, joint or lost direction that holds the arm, '' for none."""
-    if m.status == Status.SINGULAR and m.goal is not None:
-        return task.lost_words(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)
-    if m.blocker < 0:
-        return ""
-    if m.status in (Status.LIMITED, Status.SATURATED):
-        return robot.joints[m.blocker]
-    return m.world.names[m.blocker]

@@ -17,14 +17,17 @@ from rtctl.assembly import header_of, link_spec
 from rtctl.config.assets import load_assets
 from rtctl.config.base import is_base
 from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
-from rtctl.control import faults, task
+from rtctl.control import faults, task, world
+from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import R_of, quat_of
-from rtctl.errors import ConfigError, RtctlError
+from rtctl.control.world import World
+from rtctl.errors import ConfigError, PlanError, RtctlError
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import lockstep
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn
+from rtctl.stream import Follower, Seen
 from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
@@ -147,10 +150,15 @@ class Feed:
         self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its verdict not yet seen
         self.last: dict[str, Any] = {}
         self.frames = 0
+        self.planned, self.seed = scenario.planner, scenario.seed
+        self.world: World = world.empty(robot.slots, robot.meshes)  # as the controller knows it now
+        self.follower: Follower | None = None
+        self.events: list[tuple[float, str, str]] = []  # of the planner; (time [s], name, detail)
 
     def request(self, servo: Servo, truth: Truth) -> Request:
         """Return the request of this period."""
         m = servo.memory
+        self.world = m.world
         if self.waiting is not None and not m.verdict:
             self.tally.legs.append(_Leg(*self.waiting))
         self.waiting = None
@@ -163,7 +171,33 @@ class Feed:
             goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
             goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
             self.waiting = (goal, truth.time, truth.tip.copy())
+            if self.planned:
+                goal = self._first(goal, m, truth)
+        elif self.follower is not None and m.state == State.RUN:
+            goal = self._next(self.follower, m, truth)
         return Request(verb, goal, self._seen(truth))
+
+    def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
+        """Return the first sub-goal on the way to `goal`, or that itself where there is no plan."""
+        from rtctl.planner import plan  # heavy, and few scenarios plan
+
+        try:
+            self.follower = Follower(
+                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed), m.joints.q, self.seed
+            )
+        except PlanError as error:
+            self.follower = None
+            self.events.append((truth.time, "no_plan", str(error)))
+            return goal
+        return self._next(self.follower, m, truth) or goal
+
+    def _next(self, follower: Follower, m: Memory, truth: Truth) -> Goal | None:
+        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.held), m.tip.x, m.joints.q))
+        self.events += [(truth.time, "planned", text) for text in follower.news]
+        follower.news.clear()
+        if follower.over:
+            self.follower = None
+        return goal
 
     def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:
         """Return what a camera reports: everything at first, then at its rate what moves, appears or is gone."""
@@ -235,7 +269,8 @@ def simulate(
             sink = McapSink(Path(log), header_of(config, where, robot, greeting.q))
         servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
         tally = Tally(robot)
-        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime, watch)
+        feed = Feed(robot, scenario, simulator, tally)
+        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, feed, realtime, watch)
         elapsed = time.perf_counter() - begun
     finally:
         if sink is not None:
@@ -243,7 +278,7 @@ def simulate(
         link.close()
     return {
         **tally.figures(),
-        "statuses": [[_r(t + tally.offset), name, detail] for t, name, detail in servo.events if name not in SHOWN],
+        "statuses": _statuses(servo, feed),
         "mode_final": servo.memory.state.name,
         "faults": list(faults.names(servo.faults_seen)),
         "ticks": ticks,
@@ -253,11 +288,16 @@ def simulate(
     }
 
 
+def _statuses(servo: Servo, feed: Feed) -> list[list[Any]]:
+    """Return what the controller and the planner said, [t, name, detail]."""
+    said = [(t + feed.tally.offset, name, detail) for t, name, detail in servo.events if name not in SHOWN]
+    return [[_r(t), name, detail] for t, name, detail in sorted(said + feed.events, key=lambda event: event[0])]
+
+
 def _play(
-    servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool, watch: Watch | None
+    servo: Servo, scenario: Scenario, simulator: Simulator, feed: Feed, realtime: bool, watch: Watch | None
 ) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
-    feed = Feed(servo.robot, scenario, simulator, tally)
     dt, begun = servo.robot.dt, time.monotonic()
     ticks = 0
     for slot in lockstep():
@@ -266,7 +306,7 @@ def _play(
             break
         turn = servo.turn(slot, feed.request(servo, truth))
         truth = simulator.truth()
-        tally.add(truth, turn)
+        feed.tally.add(truth, turn)
         if watch is not None:
             watch(servo, truth, turn)
         ticks += 1

@@ -51,6 +51,8 @@ class Status(IntEnum):
     SATURATED = 5  # torque limits hold the arm
     SINGULAR = 6  # the direction to the goal is lost
     LIMITED = 7  # joint limits hold the arm
+    UNREACHABLE = 8  # stretched out: the goal is farther than the links are long
+    ESCAPING = 9  # circulating around what blocks the way
 
 
 class Severity(IntEnum):
@@ -132,6 +134,7 @@ class Goal(NamedTuple):
     tolerance: float  # [m] arrived within this and within tolerance_rot
     tolerance_rot: float  # [rad]
     axis: F64 = TOOL_Z  # (3,) unit vector in the tip's frame, for Task.DIRECTION
+    posture: F64 | None = None  # (n,) [rad] that the null space takes on the way, None: the robot's own
 
 
 class Shape(NamedTuple):

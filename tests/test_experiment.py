@@ -165,7 +165,7 @@ def test_a_joint_asked_beyond_its_limit_stops_short_and_is_named():
     numbers = limits.figures(data)
     assert numbers["joint_7_would_need_rad"][0] > numbers["joint_7_limit_rad"]
     assert numbers["arrived"] == [False]
-    assert numbers["diagnosis"] == ["limited panda_joint7"]
+    assert numbers["diagnosis"] == ["limited panda_joint7 at its upper limit"]
     assert 0.0 < numbers["min_joint_margin_rad"] < numbers["zone_rad"]
     assert numbers["error_m"][0] < 0.01  # the tip stays
     drawn(limits, data)

@@ -55,6 +55,7 @@ GOAL = Goal(
     0.005,
     0.02,
     np.array([0.6, 0, 0.8]),
+    np.array([0.1, 1 / 3]),
 )
 BALL = Shape(
     "ball", "sphere", np.array([0.1, 0, 0, 0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3) / 7, np.zeros(3)

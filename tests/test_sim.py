@@ -227,7 +227,7 @@ def test_an_arm_that_cannot_arrive_says_why(name: str):
     assert run.memory.status == status
     _, told, detail = run.events[-1]
     assert told == status.name.lower()
-    assert detail == what or (status == Status.SINGULAR and detail.startswith("cannot "))
+    assert what in detail
 
 
 @pytest.mark.parametrize(

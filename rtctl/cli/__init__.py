@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import experiments, logs, offline, operate
+from rtctl.cli import experiments, logs, offline, operate, plan
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -27,6 +27,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
     offline.add_before(commands)
     operate.add(commands)
+    plan.add(commands)
     offline.add_after(commands)
     experiments.add(commands)
     logs.add(commands)

@@ -13,6 +13,7 @@ from rtctl.hal.client import Session, accepted
 
 POLL = 0.05  # [s] between two looks at the status
 ARRIVED = "arrived"
+PASSED = "passed"
 MOVING_STATES = ("ARMED", "RUN")
 
 
@@ -32,7 +33,7 @@ class Outcome(NamedTuple):
             print(json.dumps(self.as_dict()), flush=True)
             return
         where = " ".join(f"{c:+.3f}" for c in self.position) + " m" if self.position else "orientation"
-        word = "arrived" if self.arrived else f"NOT REACHED: {self.why}"
+        word = self.why if self.arrived else f"NOT REACHED: {self.why}"
         print(f"goal {where}  {word}  {self.time:.2f} s  {self._missed()}", flush=True)
 
     def as_dict(self) -> dict[str, Any]:
@@ -57,6 +58,11 @@ def send(session: Session, message: dict[str, Any]) -> dict[str, Any]:
 def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> Outcome:
     """Return what became of a goal within `timeout` [s]. Raises RequestError when it is refused at once."""
     send(session, message)
+    return awaited(session, message, timeout)
+
+
+def awaited(session: Session, message: dict[str, Any], timeout: float, near: float = 0.0) -> Outcome:
+    """Return what became of the goal of `message` within `timeout` [s]; one that is `near` [m] counts as passed."""
     wanted, begin = message.get("position_m"), time.monotonic()
     while True:
         status = accepted(session.ask({"verb": "status"}))  # made after the goal was taken: never of the one before
@@ -64,24 +70,29 @@ def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> 
             wanted = status.get("goal_m") or [math.nan] * 3
         why = _end(status, wanted)
         elapsed = time.monotonic() - begin
+        if not why and near and wanted and _known(status.get("error_m")) <= near:
+            why = PASSED
         if not why and elapsed > timeout:
             why = f"{status.get('status', '?')} {status.get('detail') or ''} after {timeout:g} s".replace("  ", " ")
         if why:
             errors = [_known(status.get(key)) for key in ("error_m", "error_rad")]
-            return Outcome(wanted, why == ARRIVED, why, elapsed, *errors)
+            return Outcome(wanted, why in (ARRIVED, PASSED), why, elapsed, *errors)
         time.sleep(POLL)
 
 
 def run_stream(session: Session, lines: Iterable[str], source: str, arguments: argparse.Namespace) -> int:
     """Send the goals in `lines` one after another and return the exit code. Raises UsageError, RequestError."""
     failed = 0
+    last: dict[str, Any] | None = None
     for at, message in goal_messages(lines, source):
         try:
             if arguments.rate:
                 send(session, message)
                 time.sleep(1.0 / arguments.rate)
                 continue
-            outcome = send_and_wait(session, message, arguments.timeout)
+            send(session, message)
+            outcome = awaited(session, message, arguments.timeout, arguments.near or 0.0)
+            last = message
         except RequestError as error:
             if not arguments.keep_going:
                 raise RequestError(f"{source}:{at}: {error}") from None
@@ -89,7 +100,11 @@ def run_stream(session: Session, lines: Iterable[str], source: str, arguments: a
         outcome.show(arguments.json)
         failed += not outcome.arrived
         if failed and not arguments.keep_going:
-            break
+            return EXIT_FAILED
+    if last is not None and arguments.near:  # it was passed; the last goal is there to arrive at
+        outcome = awaited(session, last, arguments.timeout)
+        outcome.show(arguments.json)
+        failed += not outcome.arrived
     return EXIT_FAILED if failed else EXIT_OK
 
 

@@ -65,6 +65,9 @@ def add(commands: Commands) -> None:
     goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
     _add_waiting(goals)
     goals.add_argument("--rate", metavar="HZ", type=positive, help="send at this rate without waiting for arrival")
+    goals.add_argument(
+        "--pass", metavar="M", dest="near", type=positive, help="give the next goal when the tip is this near [m]"
+    )
     goals.add_argument("--keep-going", action="store_true", help="go on after a goal that was refused or not reached")
     _add_obstacle(commands)
     status = command(commands, "status", "show how things stand", "rtctl status --watch", _status)

@@ -63,6 +63,9 @@ class Scenario(Table, frozen=True, kw_only=True):
     start_q_rad: Angles | None = None  # None: the robot's home
     start_pose: Annotated[tuple[Coordinate, Coordinate, Angle], Meta(description="of a base: m, m, rad")] | None = None
     seed: Annotated[int, Meta(ge=0, le=2**53)] = 0
+    planner: Annotated[bool, Meta(description="lead the tip to each goal by the sub-goals of the global planner")] = (
+        False
+    )
     goal: Annotated[tuple[TimedGoal, ...], Meta(max_length=10_000)] = ()
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
     fault: Annotated[tuple[FaultTable, ...], Meta(max_length=1000)] = ()

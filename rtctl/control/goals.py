@@ -1,31 +1,22 @@
-"""Goals: which are taken, and what the controller says of its progress (its level of competence)."""
+"""Goals: which are taken, and when one is reached."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.types import F64, Cut, Goal, Status
+from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
 
 
 class Progress(NamedTuple):
-    """What the diagnosis looks at, all of this tick."""
+    """How far the tip is from its goal, and how fast."""
 
     error: float  # [m]
     error_rot: float  # [rad], 0 for a position task
     speed: float  # [m/s] of the tip
-    rate: float  # [rad/s] of the tip
-    goal_rho: F64  # (K,) [m] from the goal to each obstacle's surface, inf where there is none
-    rho: F64  # (K,) [m] from the arm to each
-    force: F64  # (K,) [N] magnitude of each obstacle's push
-    tau_limits: F64  # (n,) [Nm] of the joint-limit potential
-    tau_max: F64  # (n,) [Nm]
-    tau_wanted: F64  # (n,) [Nm]
-    damped: bool  # Lambda is being damped
-    cut: int  # types.Cut
-    rho0: float  # [m] influence
+    rate: float  # [rad/s] of the tip, 0 for a position task
 
 
 def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str, ...]) -> str:
@@ -54,32 +45,3 @@ def arrived(p: Progress, goal: Goal) -> bool:
 def at_rest(p: Progress) -> bool:
     """Return whether the tip is still."""
     return p.speed < STILL_SPEED and p.rate < 4.0 * STILL_SPEED
-
-
-def diagnose(p: Progress, goal: Goal, still: int, stall_ticks: int) -> tuple[Status, int]:
-    """Return the status and what holds the arm: an obstacle slot, a joint index, or -1.
-
-    An arm that rests short of its goal for `stall_ticks` is held by something. The causes are tried from the one
-    that hides the others: torque that ran out, then joint limits, then a lost direction, then obstacles.
-    """
-    if arrived(p, goal):
-        return Status.ARRIVED, -1
-    if still < stall_ticks:
-        return Status.MOVING, -1
-    ratio = np.abs(p.tau_wanted) / p.tau_max
-    if p.cut & (Cut.MAGNITUDE | Cut.MOTION_SCALED):
-        return Status.SATURATED, int(ratio.argmax())
-    nearest = int(p.goal_rho.argmin())
-    pushing = int(p.force.argmax())
-    if p.goal_rho[nearest] < p.rho0 and p.force[pushing] > 0.0:
-        return Status.SHADOWED, nearest
-    share = np.abs(p.tau_limits) / p.tau_max
-    if float(share.max()) > 0.02 and p.force[pushing] < 1.0:
-        return Status.LIMITED, int(share.argmax())
-    if p.force[pushing] > 0.0:
-        return Status.LOCAL_MINIMUM, pushing
-    if float(share.max()) > 1e-3:
-        return Status.LIMITED, int(share.argmax())
-    if p.damped:
-        return Status.SINGULAR, -1
-    return Status.LOCAL_MINIMUM, -1

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from rtctl.control.escape import Escape
 from rtctl.control.estimator import JointEstimate, TipEstimate
 from rtctl.control.faults import Counters
 from rtctl.control.model import Model
@@ -52,11 +53,15 @@ class Memory(NamedTuple):
     w_ref: F64  # (3,) [rad/s]
     goal_rho: F64  # (K,) [m] from the goal to each obstacle
     status: Status
-    blocker: int  # obstacle slot or joint index that holds the arm, -1 for none
+    blocker: int  # obstacle slot or joint index that holds the arm most, -1 for none
+    holders: int  # bits of all that hold it
+    held: tuple[str, ...]  # the same in words
+    escape: Escape
     still: int  # ticks the tip has been at rest
     # world and torque
     world: World
     rho: F64  # (K,) [m] from the arm to each obstacle
+    tau_obstacles: F64  # (n,) [Nm] of the last tick
     sent: F64  # (4, n) [Nm] the last commands, newest first
     cut: int  # types.Cut of the last tick
     pulled: bool  # the last reference for the slew was taken from the echo: the drive does not give what it is sent

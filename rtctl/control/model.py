@@ -322,6 +322,15 @@ class RigidBody:
         rho, rows = own.measure(Rj, tj, Jw, self._iv, self.chain) if own else (np.zeros(0), np.zeros((0, self.n)))
         return Model(q.copy(), qd.copy(), *terms, rho, rows)
 
+    def placed(self, q: F64, points: Points) -> F64:
+        """Return the PSPs (m, 3) [m] at q (n,), and nothing else: a planner asks thousands of times."""
+        pin.forwardKinematics(self.model, self.data, self.configuration(q))
+        for k, R, t in self._views:
+            self._Rj[k], self._tj[k] = R, t
+        P = np.empty((len(points.link), 3))
+        _place_points(self._Rj, self._tj, points.link, points.local, P)
+        return P
+
     def own_distances(self, q: F64, own: Own) -> F64:
         """Return the distances (L,) [m] of the watched pairs at q (n,), inf beyond `own.reach`."""
         pin.computeJointJacobians(self.model, self.data, self.configuration(q))

@@ -6,7 +6,8 @@ block diagram is `tick`; each block is a function below it or a module beside it
 
 import numpy as np
 
-from rtctl.control import goals, primitives, scan, watch, world
+from rtctl.control import competence, escape, goals, primitives, scan, watch, world
+from rtctl.control.escape import Escape
 from rtctl.control.estimator import held, joint_start, joint_step, start, tip_step, update_pose
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
@@ -23,13 +24,14 @@ from rtctl.control.session import (
     believed,
     detected,
     drives_torque,
+    free_of_goals,
     held_here,
     hold_at,
     supervised,
     with_goal,
 )
 from rtctl.control.so3 import quat_of
-from rtctl.control.task import error_of, lost_of, point_of, selected, selection, task_error
+from rtctl.control.task import error_of, point_of, selected, selection, task_error
 from rtctl.types import (
     F64,
     TOOL_Z,
@@ -52,7 +54,7 @@ BRAKING = (State.STOPPING, State.SAFE_STOP)
 ZERO = np.zeros(3)
 START_PACE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
-LOST = 0.5  # share of the error in lost directions from which an arm at rest is held by its singularity
+REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
 MISSED_MAX = 10  # slots that estimates coast through; more is a fault
 
 
@@ -90,7 +92,7 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         leaving=False, done=False, verdict="", joints=joints, tip=tip, innovation=0.0, model=model, space=space,
         task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero,
         watch=watch.fresh(robot.n), rest=0,
-        goal=None, hold=hold_at(model.x, model.R, robot.axes),
+        goal=None, hold=hold_at(model.x, model.R, robot.axes), holders=0, held=(), escape=Escape(), tau_obstacles=zero,
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
         rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,
     )  # fmt: skip
@@ -144,6 +146,7 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
     slow = braking and max(np.abs(m.v_ref).max(), np.abs(m.w_ref).max()) < 1e-3
     if braking and not slow:
         m = held_here(robot, m)  # the hold begins where the braking ends
+    m = _escaping(robot, m) if pursuing else m
     target = m.goal if pursuing and m.goal is not None else m.hold
     hasten = not braking or slow  # while braking the references only fall to zero
     e, e_rot = ZERO, ZERO
@@ -151,12 +154,36 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
         e, e_rot = task_error(int(target.task), target.axis, target.position, target.wxyz, m.tip.x, m.tip.R)
         if target.task != m.task:  # a goal of this tick: `space` is still that of the one before
             e, e_rot = selected(int(m.task), m.axis, m.tip.R, e, e_rot)
+    if pursuing and m.escape.active:
+        e = escape.way(m.escape, escape.push_of(m.model, m.tau_obstacles, target), robot.motion)
     law = evaluate_law(
         robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
-        m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
+        m.v_ref, m.w_ref, _posture(robot, m) if pursuing else m.q_rest, m.pace,
     )  # fmt: skip
     seen = law.rho + m.world.obstacles.margin  # where it is, not where it might be: no contact by growing old
-    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=seen), law
+    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=seen, tau_obstacles=law.tau_obstacles), law
+
+
+def _escaping(robot: Robot, m: Memory) -> Memory:
+    """Return the memory with the escape from a local minimum a tick further."""
+    s, goal = m.escape, m.goal
+    if goal is None or s.phase == escape.Phase.NONE:
+        return m
+    to = point_of(goal, m.tip.x)
+    if s.phase == escape.Phase.CHOOSING:
+        s = escape.chosen(
+            s, m.model, m.tip.x, goal._replace(position=to), m.world.obstacles, robot.base, robot.reach,
+            robot.avoid.rho0, robot.motion.epsilon,
+        )  # fmt: skip
+        return m._replace(escape=s)
+    v, _ = selected(int(goal.task), goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
+    push = escape.push_of(m.model, m.tau_obstacles, goal)
+    return m._replace(escape=escape.advanced(s, to - m.tip.x, push, scan.norm(v) < goals.STILL_SPEED, robot.dt))
+
+
+def _posture(robot: Robot, m: Memory) -> F64:
+    """Return the posture (n,) [rad] of the null space on the way to the goal."""
+    return robot.q_rest if m.goal is None or m.goal.posture is None else m.goal.posture
 
 
 def _pace(robot: Robot, m: Memory) -> float:
@@ -197,34 +224,51 @@ def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
 
 
 def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Memory:
-    """Level of competence: what the arm is doing about its goal."""
-    if m.goal is None or m.state != State.RUN:
-        return m._replace(status=Status.NO_GOAL, blocker=-1)
-    p = _progress(robot, m, law, permitted)
+    """Level of competence: what the arm is doing about its goal, and once it rests, what holds it."""
+    goal = m.goal
+    if goal is None or m.state != State.RUN:
+        return m if m.status == Status.NO_GOAL else free_of_goals(m)
+    p = _progress(m, goal)
+    if goals.arrived(p, goal):
+        return _with_status(m, Status.ARRIVED)._replace(escape=Escape(), still=m.still + 1)
+    if m.escape.active or m.escape.phase == escape.Phase.CHOOSING:
+        return m._replace(status=Status.ESCAPING, still=0)  # held by what it circulates
     still = m.still + 1 if goals.at_rest(p) else 0
-    status, blocker = goals.diagnose(p, m.goal, still, round(robot.stop.stall / robot.dt))
-    return m._replace(status=status, blocker=blocker, still=still)
+    m, stall = m._replace(still=still), round(robot.stop.stall / robot.dt)
+    if robot.escape and still == round(escape.STALL / robot.dt) and m.escape.phase == escape.Phase.NONE:
+        return _caught(robot, m, law, permitted, goal, p.error)
+    if still < stall:
+        return _with_status(m, Status.MOVING)
+    if (still - stall) % round(REVIEW / robot.dt):
+        return m
+    found = competence.held(competence.balance(robot, m, law, permitted.tau_wanted))
+    return _with_held(robot, m, law, found)._replace(status=found.status)
 
 
-def _progress(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Progress:
-    assert m.goal is not None
-    error, error_rot = error_of(m.goal, m.tip.x, m.tip.R)
-    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
-    return Progress(
-        error=error,
-        error_rot=error_rot,
-        speed=scan.norm(v),
-        rate=scan.norm(w),
-        goal_rho=m.goal_rho,
-        rho=law.rho,
-        force=scan.norms(law.force),
-        tau_limits=law.tau_limits,
-        tau_max=robot.tau_max,
-        tau_wanted=permitted.tau_wanted,
-        damped=m.space.damped and lost_of(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)[2] > LOST,
-        cut=m.cut,
-        rho0=robot.avoid.rho0,
-    )
+def _with_status(m: Memory, status: Status) -> Memory:
+    return m if m.status == status else m._replace(status=status, blocker=-1, holders=0, held=())
+
+
+def _with_held(robot: Robot, m: Memory, law: Law, found: competence.Held) -> Memory:
+    return m._replace(blocker=found.main, holders=found.mask, held=competence.names(robot, m, law, found))
+
+
+def _caught(robot: Robot, m: Memory, law: Law, permitted: Permitted, goal: Goal, error: float) -> Memory:
+    """Return the memory of an arm that has just come to rest: where obstacles hold it, with an escape begun."""
+    found = competence.held(competence.balance(robot, m, law, permitted.tau_wanted))
+    near = {Status.LOCAL_MINIMUM: robot.avoid.rho0, Status.SHADOWED: 2.0 * robot.avoid.rho0}
+    if not found.mask or error < near.get(found.status, np.inf):
+        return _with_status(m, Status.MOVING)
+    begun = escape.begun(m.escape, error, escape.push_of(m.model, law.tau_obstacles, goal))
+    if begun.phase == escape.Phase.GIVEN_UP:
+        return _with_status(m, Status.MOVING)._replace(escape=begun)
+    return _with_held(robot, m, law, found)._replace(escape=begun, status=Status.ESCAPING)
+
+
+def _progress(m: Memory, goal: Goal) -> Progress:
+    error, error_rot = error_of(goal, m.tip.x, m.tip.R)
+    v, w = selected(int(goal.task), goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
+    return Progress(error, error_rot, scan.norm(v), scan.norm(w))
 
 
 def _record(
@@ -244,7 +288,8 @@ def _record(
         rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
         tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
         tau_gravity=m.model.g + m.model.h, tau_wanted=permitted.tau_wanted, tau_sent=command.tau,
-        command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, severity=m.reaction,
+        command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, holders=m.holders,
+        escape=m.escape.phase, severity=m.reaction,
         faults=m.in_force, model_evaluated=m.evaluated,
     )  # fmt: skip
 
@@ -286,5 +331,17 @@ def warm(robot: Robot) -> None:
         moving = m._replace(state=State.RUN, goal=goal, in_force=0)
         beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))
         tick(robot, beside, feedback, Request(goal=goal, verb=Verb.RESET))  # the obstacles move on by themselves
+    _warm_competence(robot, moving, feedback)
     stopping = m._replace(state=State.SAFE_STOP, reaction=Severity.SS1)
     tick(robot, stopping, feedback, Request())
+
+
+def _warm_competence(robot: Robot, moving: Memory, feedback: Feedback) -> None:
+    """Let the arm rest short of a goal: what is asked then, and the steps of an escape."""
+    goal = Goal(moving.tip.x + 0.2, quat_of(moving.tip.R), Task.POSE, 1e-3, 1e-2)
+    resting = moving._replace(goal=goal)
+    for seconds in (escape.STALL, robot.stop.stall):
+        tick(robot, resting._replace(still=round(seconds / robot.dt) - 1), feedback, Request())
+    stalled = escape.begun(Escape(), 1.0, np.array([0.0, 1.0, 0.0]))
+    for phase in (escape.Phase.CHOOSING, escape.Phase.FIRST):
+        tick(robot, resting._replace(escape=stalled._replace(phase=phase)), feedback, Request())

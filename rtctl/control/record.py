@@ -68,6 +68,8 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
             ("state", "<u4"),  # types.State
             ("status", "<u4"),  # types.Status
             ("blocker", "<i4"),  # obstacle slot (>= 0) or -1; for LIMITED and SATURATED the joint index
+            ("holders", "<u8"),  # bits of all that hold the arm, likewise
+            ("escape", "<u4"),  # control.escape.Phase
             ("severity", "<u4"),  # types.Severity
             ("faults", "<u8"),  # bit i = control.faults.FAULTS[i]
             ("model_evaluated", "<u4"),

@@ -55,6 +55,7 @@ class Robot(NamedTuple):
     obstacles: tuple[Shape, ...]  # of the config, always there
     motion: MotionParams
     avoid: FieldParams
+    escape: bool  # circulate around what holds the arm short of its goal
     self_avoid: FieldParams
     limit: LimitParams
     estimator: EstimatorParams  # noise of the tip filter

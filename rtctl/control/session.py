@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from rtctl.control import faults, goals, scan, supervisor, task, watch, world
+from rtctl.control.escape import Escape
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
@@ -174,7 +175,7 @@ def _timed(robot: Robot, m: Memory, enabled: bool) -> set[Event]:
 
 def _entered(robot: Robot, m: Memory, state: State) -> Memory:
     """Return the memory on entering a state: every motion begins from what is measured now."""
-    m = m._replace(state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False)
+    m = free_of_goals(m)._replace(state=state, since=m.tick, off=False)
     if state in (State.ARMED, State.RUN):
         m = m._replace(v_ref=np.zeros(3), w_ref=np.zeros(3))
     if state not in (State.SAFE_STOP, State.FAULT):
@@ -202,6 +203,8 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         verdict = f"goal: not possible in state {m.state.name}"
     elif m.outside:
         verdict = "goal: a joint is still beyond its limits"
+    if goal.posture is not None and not _is_posture(robot, goal.posture):
+        verdict = verdict or f"goal: got posture {goal.posture}, wanted {robot.n} angles within the joint limits"
     wanted, why = task.within(goal.task, robot.axes)
     goal = goal._replace(task=wanted)
     rho = world.distance_from(m.world, task.point_of(goal, m.tip.x))
@@ -209,4 +212,13 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
     verdict = verdict or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
     if verdict:
         return m._replace(verdict=verdict)
-    return m._replace(goal=goal, goal_rho=rho, status=Status.MOVING, blocker=-1, still=0)
+    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING)
+
+
+def free_of_goals(m: Memory) -> Memory:
+    """Return the memory without a goal and what was known of it."""
+    return m._replace(goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, escape=Escape())
+
+
+def _is_posture(robot: Robot, q: np.ndarray) -> bool:
+    return q.shape == (robot.n,) and bool(np.isfinite(q).all() and ((robot.q_min <= q) & (q <= robot.q_max)).all())

@@ -9,7 +9,6 @@ import math
 import numpy as np
 from numba import njit
 
-from rtctl.control.linalg import matvec
 from rtctl.control.scan import norm
 from rtctl.control.so3 import R_of, error_to
 from rtctl.types import F64, Goal, Task
@@ -125,30 +124,6 @@ def error_of(goal: Goal, x: F64, R: F64) -> tuple[float, float]:
     """Return how far [m] and by what angle [rad] the tip at x (3,), R (3, 3) misses a goal; 0 where it is free."""
     e, e_rot = task_error(int(goal.task), goal.axis, goal.position, goal.wxyz, x, R)
     return norm(e), norm(e_rot)
-
-
-def lost_of(goal: Goal, Lambda_inv: F64, Lambda: F64, x: F64, R: F64) -> tuple[F64, F64, float]:
-    """Return what of the error the damping of Lambda keeps the arm from working on: [m], [rad], and its share, 0 to 1.
-
-    Asked for an acceleration e the arm gets Lambda^-1 Lambda_s e; the rest is lost. Lambda_inv (6, 6) is the undamped
-    mobility, Lambda (6, 6) the damped inertia of the task.
-    """
-    e, e_rot = task_error(int(goal.task), goal.axis, goal.position, goal.wxyz, x, R)
-    got = matvec(Lambda_inv, matvec(Lambda, np.concatenate((e, e_rot))))
-    lost, lost_rot = selected(int(goal.task), goal.axis, R, e - got[:3], e_rot - got[3:])
-    share = math.hypot(norm(lost) / max(goal.tolerance, 1e-6), norm(lost_rot) / max(goal.tolerance_rot, 1e-6))
-    whole = math.hypot(norm(e) / max(goal.tolerance, 1e-6), norm(e_rot) / max(goal.tolerance_rot, 1e-6))
-    return lost, lost_rot, min(1.0, share / whole) if whole > 0.0 else 0.0
-
-
-def lost_words(goal: Goal, Lambda_inv: F64, Lambda: F64, x: F64, R: F64) -> str:
-    """Return in words along or about which direction of the world `lost_of` says that the arm cannot move."""
-    lost, lost_rot, _ = lost_of(goal, Lambda_inv, Lambda, x, R)
-    linear = norm(lost) * goal.tolerance_rot >= norm(lost_rot) * goal.tolerance
-    v = lost if linear else lost_rot
-    if norm(v) == 0.0:
-        return ""
-    return f"cannot {'move along' if linear else 'turn about'} " + " ".join(f"{c:+.2f}" for c in v / norm(v))
 
 
 def turns(task: Task) -> bool:

@@ -110,7 +110,7 @@ def _hand(axes: Axes, data: Data, figurine: Figurine, k: int) -> None:
         fontsize=13,
         fontweight="bold",
     )
-    words = word if not joint else f"{word}:\n{joint.removeprefix('panda_')}"
+    words = word if not joint else f"{word}:\n{joint.removeprefix('panda_').partition(' at ')[0]}"
     axes.text(
         0.0, -0.05, words, va="top", transform=axes.transAxes, fontsize=13, color=INK if word == "arrived" else RED
     )

@@ -74,12 +74,13 @@ class Console:
         self._camera_refusal = ""  # the tick's word on the camera's last news; told with the next frame
         self._credit = BYTES_PER_SLOT  # bytes that may be read before the next ones must wait
         self._status: StatusFn = dict
+        self._world: StatusFn = dict
         self._snapshot, self._snapshot_slot = b"", -1
         self._slot = 0
 
-    def publish(self, status: StatusFn) -> None:
-        """Set where snapshots come from. Called only when somebody asks, and at most once in STATUS_AGE."""
-        self._status = status
+    def publish(self, status: StatusFn, world: StatusFn = dict) -> None:
+        """Set where snapshots come from. Called only when somebody asks; `status` at most once in STATUS_AGE."""
+        self._status, self._world = status, world
 
     def poll(self, slot: int) -> Request:
         """Return the request for the tick of `slot`; call `answer` after that tick. Never blocks, bounded work."""
@@ -189,6 +190,8 @@ class Console:
         match message:
             case messages.Status():
                 self._reply_raw(peer, self._status_reply())
+            case messages.World():
+                self._reply_raw(peer, self._encoded(self._world))
             case messages.ObstaclesMessage() | messages.CloudFrame(header=messages.CloudMessage(feed=True)):
                 notices = messages.notices_of(message, time.monotonic())
                 self._queue(notices)
@@ -245,13 +248,15 @@ class Console:
     def _status_reply(self) -> bytes:
         """Return the encoded snapshot, renewed when it is older than STATUS_AGE."""
         if self._snapshot_slot < 0 or (self._slot - self._snapshot_slot) * self._period >= STATUS_AGE:
-            try:
-                self._snapshot = msgspec.json.encode({"ok": True, **self._status()}, enc_hook=_plain)
-            except Exception as error:  # a report that fails must not stop the arm
-                self.counts["status_failed"] += 1
-                return msgspec.json.encode({"ok": False, "error": f"no status: {error}"})
-            self._snapshot_slot = self._slot
+            self._snapshot, self._snapshot_slot = self._encoded(self._status), self._slot
         return self._snapshot
+
+    def _encoded(self, report: StatusFn) -> bytes:
+        try:
+            return msgspec.json.encode({"ok": True, **report()}, enc_hook=_plain)
+        except Exception as error:  # a report that fails must not stop the arm
+            self.counts["status_failed"] += 1
+            return msgspec.json.encode({"ok": False, "error": f"no status: {error}"})
 
     def _orientation(self) -> list[float]:
         """Return the tip's present orientation, for a goal that holds it."""

@@ -26,6 +26,7 @@ from rtctl.config.obstacles import (
     contradiction,
     shape_of,
 )
+from rtctl.config.structs import Angles
 from rtctl.control.task import point_of, within
 from rtctl.errors import RequestError
 from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
@@ -86,6 +87,11 @@ class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
     tool_axis: ToolAxis | None = None
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=10.0)] | None = None  # of an arm at most 0.1
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
+    posture_rad: Angles | None = None
+
+
+class World(_Message, tag="world", frozen=True):
+    """Ask which obstacles the controller knows of."""
 
 
 class ObstacleMessage(_Message, tag="obstacle", frozen=True, kw_only=True):
@@ -126,7 +132,7 @@ class CloudFrame(NamedTuple):
     steps: bytes
 
 
-Message = Arm | Disarm | Stop | Reset | Recover | Status | GoalMessage | ObstacleMessage | ObstaclesMessage
+Message = Arm | Disarm | Stop | Reset | Recover | Status | World | GoalMessage | ObstacleMessage | ObstaclesMessage
 VERBS = {Arm: Verb.ARM, Disarm: Verb.DISARM, Stop: Verb.STOP, Reset: Verb.RESET, Recover: Verb.RECOVER}
 
 _decoder = msgspec.json.Decoder(Message, strict=True)
@@ -201,7 +207,7 @@ def request_of(
             return Request(goal=_goal_of(message, bounds, orientation))
         case ObstacleMessage() | ObstaclesMessage() | CloudFrame():
             return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message, now)))
-        case Status():
+        case Status() | World():
             return Request()
         case _:
             return Request(verb=VERBS[type(message)])
@@ -264,6 +270,8 @@ def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Seq
         key, got, wanted = found
         raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
     goal = goal_from(message, lambda: np.array(orientation()), bounds.tolerance, bounds.tolerance_rot)
+    if message.posture_rad is not None:
+        goal = goal._replace(posture=np.array(message.posture_rad, dtype=np.float64))
     task, why = within(goal.task, bounds.axes)
     if why:
         raise RequestError(why)

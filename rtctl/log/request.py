@@ -78,4 +78,5 @@ def _goal(body: dict[str, Any]) -> Goal:
         float(body["tolerance"]),
         float(body["tolerance_rot"]),
         np.array(body["axis"], np.float64),
+        None if body.get("posture") is None else np.array(body["posture"], np.float64),
     )

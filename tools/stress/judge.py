@@ -63,35 +63,46 @@ def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
     if m.goal is None:
         return _why_no_goal(servo, plant)
     wide = robot.avoid.rho0 + robot.avoid.look_ahead * 0.5 * robot.motion.v_max
-    tau = servo.memory.sent[0]
     stall = round(robot.stop.stall / robot.dt)
     rest = _speed(watch.path_of[-stall:], robot.dt) if len(watch.path_of) > stall else np.inf
-    if status == "moving":
-        return "" if rest > REST or m.still < stall else f"moving, at {1e3 * rest:.1f} mm/s for {robot.stop.stall} s"
+    if status in ("moving", "escaping"):
+        return "" if rest > REST or m.still < stall else f"{status}, at {1e3 * rest:.1f} mm/s for {robot.stop.stall} s"
     if rest > 4.0 * REST and status != "shadowed":
         return f"{status}, yet the tip moves at {1e3 * rest:.1f} mm/s"
-    if status == "limited":
-        i = robot.joints.index(detail)
-        margin = min(plant.q[i] - robot.q_min[i], robot.q_max[i] - plant.q[i])
-        zone = float(robot.limit.rho0[i])
-        return "" if margin < zone + 0.01 else f"limited by {detail}, which has {margin:.3f} rad to go"
-    if status == "shadowed":
-        gap = goal_gap(plant, detail, m.goal.position)
-        return "" if gap < wide else f"shadowed by {detail}, {gap:.3f} m from the goal"
-    if status == "local_minimum":
-        if not detail:
-            return "local_minimum with nothing that holds the arm"
-        gap = plant.clearances().get(detail, np.inf)
-        return "" if gap < wide + OVERHANG else f"local_minimum at {detail}, which is {gap:.3f} m away"
-    if status == "saturated":
-        i = robot.joints.index(detail)
-        ratio = abs(tau[i]) / robot.tau_max[i]
-        return "" if ratio > 0.9 else f"saturated by {detail}, which has {ratio:.2f} of its torque"
-    if status == "singular":
+    if status in ("limited", "shadowed", "local_minimum", "saturated"):
+        told = [_untrue(servo, plant, wide, status, part) for part in detail.split("; ")]
+        return "; ".join(part for part in told if part)
+    if status in ("singular", "unreachable"):
         sigma = least_eigenvalue(robot, plant, [i for i in range(6) if int(m.goal.task) >> i & 1])
         bound = SINGULAR * robot.motion.epsilon
-        return "" if sigma < bound else f"singular, with {sigma:.3g} of {robot.motion.epsilon:g}"
+        return "" if sigma < bound else f"{status}, with {sigma:.3g} of {robot.motion.epsilon:g}"
     return f"status {status} of an arm {watch.legs[-1].error:.3f} m short"
+
+
+def _untrue(servo: Servo, plant: Plant, wide: float, status: str, detail: str) -> str:
+    """Return what is untrue of one of those that are said to hold the arm, '' when it is borne out."""
+    m, robot = servo.memory, servo.robot
+    name, _, rest = detail.partition(" at ")
+    if status == "limited":
+        i = robot.joints.index(name)
+        margin = plant.q[i] - robot.q_min[i] if "lower" in rest else robot.q_max[i] - plant.q[i]
+        zone = float(robot.limit.rho0[i])
+        return "" if margin < zone + 0.01 else f"limited by {detail}, which has {margin:.3f} rad to go"
+    if status == "saturated":
+        i = robot.joints.index(name)
+        ratio = abs(m.sent[0][i]) / robot.tau_max[i]
+        return "" if ratio > 0.9 else f"saturated by {detail}, which has {ratio:.2f} of its torque"
+    if status == "shadowed":
+        assert m.goal is not None
+        gap = goal_gap(plant, name, m.goal.position)
+        return "" if gap < wide else f"shadowed by {detail}, {gap:.3f} m from the goal"
+    if " and " in detail:  # two links
+        own = plant.self_clearance()
+        return "" if own < robot.self_avoid.rho0 + OVERHANG else f"local_minimum of {detail}, {own:.3f} m apart"
+    if not rest:
+        return f"local_minimum with {detail or 'nothing'} that holds the arm"
+    gap = plant.clearances().get(name, np.inf)
+    return "" if gap < wide + OVERHANG else f"local_minimum at {detail}, which is {gap:.3f} m away"
 
 
 def _why_no_goal(servo: Servo, plant: Plant) -> str:

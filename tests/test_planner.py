@@ -1,0 +1,168 @@
+"""The planner's paths by independent geometry, the stream of sub-goals, and the trap with and without it."""
+
+import json
+from itertools import pairwise
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from rtctl.cli import main
+from rtctl.cli.values import goal_messages
+from rtctl.config.obstacles import shape_of
+from rtctl.config.read import convert
+from rtctl.config.scenario import Scenario, load_scenario, scenario_dict
+from rtctl.control import world
+from rtctl.control.own import hulls_of
+from rtctl.errors import PlanError
+from rtctl.hal.messages import GoalMessage, decode
+from rtctl.planner import plan
+from rtctl.stream import REPLANS, Follower, Seen
+from rtctl.types import F64, Goal, Task
+from tests.lab import ROOT, changed, play, robot
+
+TRAP = ROOT / "configs" / "scenarios" / "trap.toml"
+UNIT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def trap(**keys: object) -> dict[str, Any]:
+    return {**scenario_dict(load_scenario(TRAP)), **keys}
+
+
+def to(x: float, y: float, z: float) -> Goal:
+    return Goal(np.array([x, y, z]), UNIT, Task.POSITION, 0.003, 0.015)
+
+
+def test_a_planned_way_is_clear_of_everything_by_coal_and_the_same_for_the_same_seed():
+    arm, scenario = robot(), load_scenario(TRAP)
+    shapes = tuple(shape_of(o) for o in scenario.obstacle)
+    obstacles = world.with_static(world.empty(arm.slots), shapes).obstacles
+    start = np.array(scenario.start_q_rad)
+    goals = plan(arm, start, to(0.53, 0.0, 0.22), obstacles, seed=3)
+    again = plan(arm, start, to(0.53, 0.0, 0.22), obstacles, seed=3)
+    assert [g.position.tobytes() for g in goals] == [g.position.tobytes() for g in again]
+    assert goals[-1].task == Task.POSITION
+    assert goals[-1].position.tolist() == [0.53, 0.0, 0.22]
+    path = np.array([start, *(g.posture for g in goals)])
+    model, data = arm.body.model, arm.body.model.createData()
+    joints = {link: j for j, link in arm.body.link_of.items()}
+    boxes = [(coal.Box(*s.dims[:3]), coal.Transform3s(np.eye(3), s.position)) for s in shapes]
+    hulls = [h for h in hulls_of(arm.body) if h.link > 0]
+    for a, b in pairwise(path):
+        for part in np.linspace(0.0, 1.0, 4):
+            q = a + part * (b - a)
+            assert ((arm.q_min < q) & (q < arm.q_max)).all()
+            pin.forwardKinematics(model, data, q)
+            for hull in hulls:
+                X = data.oMi[joints[hull.link]]
+                at = coal.Transform3s(X.rotation, X.translation)
+                for box, pose in boxes:
+                    d = coal.distance(hull.shape, at, box, pose, coal.DistanceRequest(), coal.DistanceResult())
+                    assert d > arm.avoid.rho_min
+
+
+def test_the_trap_is_left_by_the_planned_way_without_contact():
+    run = play(trap(duration_s=4.4))
+    assert run.figures["arrived"]
+    assert run.figures["contacts"] == 0
+    assert run.figures["min_clearance_m"]["all"] > 0.02
+    assert run.figures["max_speed_m_s"] <= 1.02 * run.robot.motion.v_max
+
+
+def test_the_trap_is_reported_by_a_controller_that_is_left_alone(tmp_path):
+    run = play(trap(duration_s=5.4, planner=False), changed(tmp_path, self_collision="true\nescape = false"))
+    _, status, detail = run.events[-1]
+    assert status == "local_minimum"
+    assert {part.partition(" at ")[0] for part in detail.split("; ")} <= {"floor", "near", "far", "left", "right"}
+    assert not run.figures["arrived"]
+    assert run.figures["contacts"] == 0
+
+
+def test_what_has_no_way_is_said_so():
+    arm = robot()
+    nothing = world.empty(arm.slots).obstacles
+    with pytest.raises(PlanError, match=r"no posture .* has the goal 0.000 0.000 2.000"):
+        plan(arm, arm.home, to(0.0, 0.0, 2.0), nothing)
+    table = [{"name": "slab", "type": "box", "size_m": (0.3, 0.3, 0.3), "position_m": (0.5, 0.0, 0.2)}]
+    shapes = tuple(shape_of(o) for o in load_obstacles(table))
+    with pytest.raises(PlanError, match="touches something"):
+        plan(arm, arm.home, to(0.5, 0.0, 0.3), world.with_static(world.empty(arm.slots), shapes).obstacles)
+
+
+def load_obstacles(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
+    return convert({"robot": "panda", "duration_s": 1.0, "obstacle": rows}, Scenario, "test").obstacle
+
+
+def test_the_command_prints_lines_that_the_stream_of_goals_takes(capsys):
+    assert (
+        main(["plan", "configs/panda.toml", "--to", "0.4", "0.2", "0.4", "--from", *["0"] * 3, "-1.5", "0", "1.5", "0"])
+        == 0
+    )
+    out = capsys.readouterr()
+    goals = [message for _, message in goal_messages(out.out.splitlines(), "plan")]
+    assert f"{len(goals)} sub-goals" in out.err
+    for goal in goals:
+        taken = decode(json.dumps(goal).encode())
+        assert isinstance(taken, GoalMessage)
+        assert taken.posture_rad is not None
+    assert goals[-1]["position_m"] == [0.4, 0.2, 0.4]
+    assert "wxyz" not in goals[-1]
+
+
+class Plans:
+    """Counts the plans it is asked for."""
+
+    def __init__(self, fail_from: int = 99) -> None:
+        self.asked: list[tuple[F64, int]] = []
+        self.fail_from = fail_from
+
+    def __call__(self, q: F64, seed: int) -> list[Goal]:
+        self.asked.append((q, seed))
+        if len(self.asked) > self.fail_from:
+            raise PlanError("plan: no path")
+        return [to(0.1 * k, 0.0, 0.5)._replace(posture=np.full(3, 0.1 * k)) for k in range(1, 4)]
+
+
+def seen(x: float, status: str = "moving", q: float | None = None) -> Seen:
+    return Seen(status, "wall at hand", np.array([x, 0.0, 0.5]), np.full(3, x if q is None else q))
+
+
+def given(follower: Follower, view: Seen) -> float | None:
+    goal = follower.next(view)
+    return None if goal is None else float(goal.position[0])
+
+
+def test_sub_goals_are_passed_near_and_the_last_one_is_arrived_at():
+    follower = Follower(Plans(), np.zeros(3))
+    assert given(follower, seen(0.0)) == 0.1
+    assert given(follower, seen(0.02)) is None
+    assert given(follower, seen(0.05, q=0.9)) is None  # the elbow is not there yet
+    assert given(follower, seen(0.05)) == 0.2
+    assert given(follower, seen(0.15)) == pytest.approx(0.3)
+    assert given(follower, seen(0.29)) is None
+    assert follower.over == ""
+    assert given(follower, seen(0.3, "arrived")) is None
+    assert follower.over == "arrived"
+
+
+@pytest.mark.parametrize("status", ["local_minimum", "limited", "escaping"])
+def test_what_holds_the_arm_is_planned_around_from_where_it_is_a_bounded_number_of_times(status: str):
+    plans = Plans()
+    follower = Follower(plans, np.zeros(3), seed=7)
+    follower.next(seen(0.0))
+    for k in range(REPLANS):
+        assert given(follower, seen(0.3, status)) == 0.1
+        assert plans.asked[-1][0].tolist() == [0.3] * 3
+        assert plans.asked[-1][1] == 8 + k
+        assert status in follower.news[-1]
+    assert given(follower, seen(0.3, status)) is None
+    assert follower.over == f"{status}: wall at hand"
+
+
+def test_a_plan_that_fails_on_the_way_ends_it_with_both_reasons():
+    follower = Follower(Plans(fail_from=1), np.zeros(3))
+    follower.next(seen(0.0))
+    assert given(follower, seen(-0.1, "limited")) is None
+    assert follower.over == "limited: wall at hand; plan: no path"
