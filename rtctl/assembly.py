@@ -1,14 +1,18 @@
 """From a checked config to the parts that the daemon and the simulation put together."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 
 from rtctl.config import Config, scales
-from rtctl.config.urdf import urdf_file
+from rtctl.config.obstacles import quaternion
+from rtctl.config.urdf import package_folders, urdf_file
 from rtctl.control.robot import Robot
+from rtctl.control.so3 import R_of, quat_of
 from rtctl.hal.can import JointSpec, LinkSpec
-from rtctl.log.header import Header, make_header
+from rtctl.log.header import SCENE_FILE, Header, make_header
+from rtctl.log.mesh import MESHES, archive
 from rtctl.types import F64
 
 
@@ -30,12 +34,33 @@ def link_spec(config: Config) -> LinkSpec:
 
 def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) -> Header:
     """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included."""
+    urdf = urdf_file(config.robot.urdf, path)
+    text = urdf.read_text(encoding="utf-8")
+    files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot)}
+    if meshes := archive(text, urdf.parent, package_folders(urdf)):
+        files[MESHES] = meshes
     return make_header(
         robot.name,
         robot.joints,
         robot.slots,
         robot.dt,
         config=path.read_text(encoding="utf-8"),
-        urdf=urdf_file(config.robot.urdf, path).read_text(encoding="utf-8"),
+        urdf=text,
         extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), **extra},
+        files=files,
     )
+
+
+def scene_of(config: Config, robot: Robot) -> str:
+    """Return as JSON what the recorder needs to draw the arm and its obstacles without knowing the robot."""
+    base = config.robot.base_pose
+    wxyz = quat_of(R_of(quaternion(base.rpy_rad, base.wxyz)))
+    points = [[int(link), *p] for link, p in zip(robot.points.link, robot.points.local.tolist(), strict=True)]
+    shapes = [{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in robot.obstacles]
+    scene = {
+        "base": {"position": list(base.position_m), "wxyz": wxyz.tolist()},
+        "tip_frame": config.robot.tip_frame,
+        "points": points,
+        "obstacles": shapes,
+    }
+    return json.dumps(scene)

@@ -84,7 +84,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         link = stack.enter_context(closing(_opened(config)))
         say(f"rtctl: {robot.name} on {config.link.interface}:{config.link.channel}, console {console.path}")
         greeting = link.handshake(listen=0.0 if lockstep else 1e-3 * config.link.listen_ms, recover=True)
-        recorder = _recorder(config, path, robot, greeting.q)
+        recorder = _recorder(config, path, robot, greeting.q, dry=str(int(dry)))
         servo = Servo(robot, link, recorder, greeting.q, dry)
         console.publish(lambda: status(servo, recorder))
         if not lockstep:
@@ -126,11 +126,11 @@ def _opened(config: Config) -> CanLink:
     return CanLink(spec, transport)
 
 
-def _recorder(config: Config, path: Path, robot: Robot, q: np.ndarray) -> Recorder:
+def _recorder(config: Config, path: Path, robot: Robot, q: np.ndarray, **extra: str) -> Recorder:
     log = config.log
     return Recorder.start(
         log.directory,
-        header_of(config, path, robot, q),
+        header_of(config, path, robot, q, **extra),
         capacity=1 << (round(log.ring_MB * 1e6) - 1).bit_length(),
         segment_s=log.segment_s,
         segment_bytes=round(log.segment_MB * 1e6),

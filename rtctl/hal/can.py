@@ -107,6 +107,10 @@ class CanLink:
             b"\0\0" + payload + self._padding
         )
 
+    def set_counter(self, joint: int, counter: int) -> None:
+        """Go on counting a joint's protected frames behind `counter`: a replay takes up a log's count."""
+        self._counters[joint] = counter & 0xFF
+
     def write(self, command: Command) -> list[bytes]:
         """Send one frame to each joint, or drop it; return the raw frames that went out."""
         special = _SPECIAL.get(command.drive)

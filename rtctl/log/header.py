@@ -1,5 +1,6 @@
 """The header of a log: everything that is known before the first tick, enough to replay the log alone."""
 
+import base64
 import json
 import platform
 import subprocess
@@ -14,6 +15,8 @@ import numpy as np
 from rtctl.control.record import record_dtype
 
 PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
+
+SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing
 
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
 
@@ -32,7 +35,7 @@ class Header(NamedTuple):
     versions: Mapping[str, str]
     revision: str  # of the program's own repository, "" when it does not run from one
     extra: Mapping[str, str]  # handshake values, realtime settings, ...
-    files: Mapping[str, str]  # further attachments: name -> text (scenario, DBC)
+    files: Mapping[str, str | bytes]  # further attachments by name (scenario, DBC, meshes)
 
     @property
     def config_sha256(self) -> str:
@@ -49,7 +52,7 @@ def make_header(
     urdf: str = "",
     buses: Sequence[str] = ("can0",),
     extra: Mapping[str, str] | None = None,
-    files: Mapping[str, str] | None = None,
+    files: Mapping[str, str | bytes] | None = None,
 ) -> Header:
     """Return the header of a robot of `joints` and `slots` obstacle slots ticking each `period` [s]."""
     return Header(
@@ -109,7 +112,21 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
 
 def header_to_json(header: Header) -> str:
     """Return the header as JSON text, for the ring and for the log's metadata."""
-    return json.dumps(header._replace(dtype=dtype_to_json(header.dtype))._asdict())  # type: ignore[arg-type]
+    raw = header._replace(dtype=dtype_to_json(header.dtype))._asdict()  # type: ignore[arg-type]
+    return json.dumps({**raw, "files": {name: _to_text(content) for name, content in header.files.items()}})
+
+
+def _to_text(content: str | bytes) -> str | list[str]:
+    return content if isinstance(content, str) else [base64.b64encode(content).decode()]
+
+
+def _from_text(value: Any) -> str | bytes:
+    return base64.b64decode(value[0]) if isinstance(value, list) else str(value)
+
+
+def of_attachment(name: str, data: bytes) -> str | bytes:
+    """Return an attachment's content as `Header.files` has it: bytes for archives, text for everything else."""
+    return data if name.endswith(".zip") else data.decode("utf-8", "replace")
 
 
 def header_from_json(text: str) -> Header:
@@ -130,5 +147,5 @@ def header_from_json(text: str) -> Header:
         versions={str(k): str(v) for k, v in raw["versions"].items()},
         revision=str(raw["revision"]),
         extra={str(k): str(v) for k, v in raw["extra"].items()},
-        files={str(k): str(v) for k, v in raw["files"].items()},
+        files={str(k): _from_text(v) for k, v in raw["files"].items()},
     )

@@ -2,13 +2,13 @@
 
 import mmap
 import struct
-import zlib
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
+from isal import isal_zlib
 from mcap.opcode import Opcode
 
 from rtctl.log.summary import INDEX_ENTRY, MAGIC
@@ -102,7 +102,7 @@ def chunk_data(data: Source, head: ChunkHead) -> bytes:
         raise Damaged(f"chunk: {error}") from None
     finally:
         raw.release()
-    if len(records) != head.size or (head.crc and zlib.crc32(records) != head.crc):
+    if len(records) != head.size or (head.crc and isal_zlib.crc32(records) != head.crc):
         raise Damaged("chunk: checksum or size differs")
     return records
 
