@@ -11,8 +11,11 @@ from rtctl.config.urdf import package_folders, urdf_file
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import R_of, quat_of
 from rtctl.hal.can import JointSpec, LinkSpec
+from rtctl.log.dbc import DBC, dbc_of
+from rtctl.log.dbc import Joint as DbcJoint
 from rtctl.log.header import SCENE_FILE, Header, make_header
 from rtctl.log.mesh import MESHES, archive
+from rtctl.protocol import mit
 from rtctl.types import F64
 
 
@@ -36,7 +39,7 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) ->
     """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included."""
     urdf = urdf_file(config.robot.urdf, path)
     text = urdf.read_text(encoding="utf-8")
-    files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot)}
+    files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
     if meshes := archive(text, urdf.parent, package_folders(urdf)):
         files[MESHES] = meshes
     return make_header(
@@ -51,12 +54,20 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) ->
     )
 
 
+def drive_dbc(config: Config) -> str:
+    """Return the DBC of the robot's own identifiers and scales."""
+    joints = [DbcJoint(j.name, j.can_id, *scale) for j, scale in zip(config.robot.joints, scales(config), strict=True)]
+    return dbc_of(joints, config.link.protocol == "mit+e2e", mit.REPLY_OFFSET, mit.KP_MAX, mit.KD_MAX)
+
+
 def scene_of(config: Config, robot: Robot) -> str:
     """Return as JSON what the recorder needs to draw the arm and its obstacles without knowing the robot."""
     base = config.robot.base_pose
     wxyz = quat_of(R_of(quaternion(base.rpy_rad, base.wxyz)))
     points = [[int(link), *p] for link, p in zip(robot.points.link, robot.points.local.tolist(), strict=True)]
-    shapes = [{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in robot.obstacles]
+    shapes = [
+        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in robot.obstacles
+    ]
     scene = {
         "base": {"position": list(base.position_m), "wxyz": wxyz.tolist()},
         "tip_frame": config.robot.tip_frame,

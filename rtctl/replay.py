@@ -1,4 +1,4 @@
-"""Replay: the pure tick once more on the inputs of a log, from the log alone; the same bits, or where they differ first.
+"""Replay: the pure tick once more on the inputs of a log, from the log alone: the same bits, or where they differ.
 
 The command frames are made anew by the daemon's own encoder, so that what is compared is what went over the bus.
 """
@@ -27,7 +27,7 @@ from rtctl.log.fields import size_of, unit_of
 from rtctl.log.mesh import unpacked
 from rtctl.log.replay import Logged, inputs
 from rtctl.log.run import Run
-from rtctl.log.topic import CAN_ROW, Structured
+from rtctl.log.topic import CAN_ROW, Structured, stacked
 from rtctl.protocol import frame
 from rtctl.servo import first_feedback
 from rtctl.types import F64, I64, Command, Drive
@@ -195,8 +195,8 @@ class _Check:
 
     def compare(self, logged: list[Any], replayed: list[Any]) -> None:
         """Take a block of ticks into account."""
-        ours = np.concatenate(replayed)
-        theirs = np.stack(logged).reshape(-1)
+        ours = np.frombuffer(b"".join(record.tobytes() for record in replayed), replayed[0].dtype)
+        theirs = np.frombuffer(b"".join(record.tobytes() for record in logged), logged[0].dtype)
         self.time.append(np.array(theirs["time"]))
         self.tau.append(np.array(ours["tau_sent"]))
         self.tau_logged.append(np.array(theirs["tau_sent"]))
@@ -223,6 +223,7 @@ class _Check:
     def _note(self, name: str, a: Any, b: Any, rows: Any, ticks: Any) -> None:
         with np.errstate(invalid="ignore"):
             gap = np.abs(a[rows].astype(np.float64) - b[rows].astype(np.float64)).reshape(len(rows), -1)
+        gap[(a[rows] == b[rows]).reshape(gap.shape)] = 0.0  # inf and inf
         worst = np.where(np.isnan(gap), np.inf, gap).max(axis=1)
         k = int(worst.argmax())
         old = self._found.get(name)
@@ -237,7 +238,9 @@ class _Check:
         index = np.unravel_index(int(np.flatnonzero(_differ(one.reshape(-1, 1), two.reshape(-1, 1)))[0]), one.shape)
         x, y = one[index], two[index]
         part = part_of(name, index, self.run.header.joints) if a[name].shape else ""
-        return Divergence(int(a["tick"]), float(a["time"]), part, name, repr(x.item()), repr(y.item()), size_of(name, x, y))
+        return Divergence(
+            int(a["tick"]), float(a["time"]), part, name, repr(x.item()), repr(y.item()), size_of(name, x, y)
+        )
 
     def differences(self) -> tuple[Difference, ...]:
         """Return the fields that differ, in the order of the record."""
@@ -288,7 +291,7 @@ class _Wire:
                 self._ended = True
                 return
             self._time = np.concatenate([self._time, more[0]])
-            self._waiting = np.concatenate([self._waiting, more[1]])
+            self._waiting = stacked([self._waiting, more[1]], CAN_ROW)
 
     def prime(self, time: int) -> None:
         """Continue the counters of the log, which the handshake has moved: those of its first commands, less one."""

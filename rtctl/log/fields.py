@@ -6,6 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
+ULPS = 1_000_000  # beyond this many, units of the last place say nothing
+
+
 class Field(NamedTuple):
     """A field of `control.record`."""
 
@@ -71,7 +74,9 @@ def size_of(name: str, a: Any, b: Any) -> str:
     if not isinstance(a, np.floating):
         return str(int(b) - int(a))
     unit = unit_of(name)
-    return f"{float(b) - float(a):.3g}{' ' if unit else ''}{unit} ({_ulps(float(a), float(b))} ulp)"
+    apart = _ulps(float(a), float(b))
+    steps = f" ({apart:+d} ulp)" if abs(apart) < ULPS else ""
+    return f"{float(b) - float(a):.3g}{' ' if unit else ''}{unit}{steps}"
 
 
 def _ulps(a: float, b: float) -> int:

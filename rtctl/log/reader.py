@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from mcap import records
 
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.catalog import Catalog, ChunkRef, attachment, catalog, describe_chunk
 from rtctl.log.header import Header, header_from_json, of_attachment
+from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.log.segment import INFO, OPEN
 from rtctl.log.summary import INDEX_ENTRY
-from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.log.topic import Part, Topic, rows_of
 from rtctl.log.walk import I64_MAX, MESSAGE, RECORD, Damaged, Source, chunk_data, chunk_head, chunk_messages
 from rtctl.log.walk import message_index as index_entries
@@ -72,6 +73,13 @@ class Log:
     def size(self) -> int:
         """Return the size of the file [bytes] when it was opened."""
         return len(self._data)
+
+    def channel(self, topic: str) -> tuple[records.Channel, records.Schema | None]:
+        """Return the channel and schema records of a topic. Raises LogError when the file has no such topic."""
+        for channel in self._catalog.channels.values():
+            if channel.topic == topic:
+                return channel, self._catalog.schemas.get(channel.schema_id)
+        raise LogError(f"{self.path}: no topic {topic}; it has {', '.join(self.topics)}")
 
     def schema_of(self, topic: str) -> str:
         """Return the name of a topic's schema, or its encoding when it has none."""
@@ -185,9 +193,7 @@ class Log:
         if self._catalog.loose:
             yield self._topic(topic, [], True)
 
-    def _topic(
-        self, name: str, chunks: list[ChunkRef], loose: bool, start: int = 0, stop: int = I64_MAX
-    ) -> Topic:
+    def _topic(self, name: str, chunks: list[ChunkRef], loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
         if not ids:
             raise LogError(f"{self.path}: no topic {name}; it has {', '.join(self.topics)}")
@@ -211,12 +217,14 @@ class Log:
 
         def one(chunk: ChunkRef) -> T | None:
             content = self._chunk(chunk)
-            return None if content is None else work(_part(content, self._offsets(chunk, channel, content), channel, start, stop))
+            return (
+                None
+                if content is None
+                else work(_part(content, self._offsets(chunk, channel, content), channel, start, stop))
+            )
 
         wanted = [
-            c
-            for c in chunks
-            if c.end_time >= start and c.start_time < stop and (not c.indices or channel in c.indices)
+            c for c in chunks if c.end_time >= start and c.start_time < stop and (not c.indices or channel in c.indices)
         ]
         if len(wanted) > 2:
             with ThreadPoolExecutor(THREADS) as pool:

@@ -77,12 +77,22 @@ class Topic:
     def __getattr__(self, field: str) -> np.ndarray[Any, Any]:
         if field.startswith("_"):
             raise AttributeError(field)
+        try:
+            return self.field(field)
+        except LogError as error:
+            raise AttributeError(str(error)) from None
+
+    def field(self, name: str) -> np.ndarray[Any, Any]:
+        """Return one field (N, ...); `time` here is the record's robot time [s], the attribute is log_time.
+
+        Raises LogError when the topic has no such field.
+        """
         known = self.fields
-        if field not in known:
-            raise AttributeError(f"{self.name} has no field {field}; it has {', '.join(known)}")
+        if name not in known:
+            raise LogError(f"{self.name} has no field {name}; it has {', '.join(known)}")
         if self.dtype is None:
-            return np.ascontiguousarray(self.array[field])
-        return self._ticks.field(field)
+            return np.ascontiguousarray(self.array[name])
+        return self._ticks.field(name)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -139,9 +149,9 @@ class Topic:
         if self.dtype is not None:
             dtype, layout = self.dtype, tick_layout(self.dtype)
             found = self.source(lambda part: _records(self.name, part, layout, dtype))
-            return np.concatenate(found) if found else np.zeros(0, dtype)
+            return stacked(found, dtype)
         found = self.source(lambda part: _frames(self.name, part))
-        return np.concatenate(found) if found else np.zeros(0, CAN_ROW)
+        return stacked(found, CAN_ROW)
 
     @property
     def json(self) -> list[dict[str, Any]]:
@@ -183,7 +193,10 @@ class _Ticks:
         found = self.source(take)
         none = np.zeros(0, np.int64)
         if self._times is None:
-            self._times = np.concatenate([f[0] for f in found] or [none]), np.concatenate([f[1] for f in found] or [none])
+            self._times = (
+                np.concatenate([f[0] for f in found] or [none]),
+                np.concatenate([f[1] for f in found] or [none]),
+            )
         for i, (name, (kind, _)) in enumerate(kinds.items()):
             block = np.concatenate([f[2][i] for f in found] or [np.zeros((0, kind.itemsize), np.uint8)])
             self._found[name] = block.reshape(-1).view(kind.base).reshape(len(block), *kind.shape)
@@ -211,6 +224,13 @@ def _lead(layout: Layout, at: int) -> int:
     return count
 
 
+def stacked(arrays: Sequence[Structured], dtype: np.dtype[np.void]) -> Structured:
+    """Return contiguous arrays of one dtype as one; numpy would compare the dtypes field by field for each."""
+    if len(arrays) == 1:
+        return arrays[0]
+    return np.concatenate([a.view(np.uint8) for a in arrays] or [np.zeros(0, np.uint8)]).view(dtype)
+
+
 def joined(parts: Sequence[Topic]) -> Topic:
     """Return topics of one name and kind, one behind the other, as one."""
     first = parts[0]
@@ -219,7 +239,11 @@ def joined(parts: Sequence[Topic]) -> Topic:
     if any(part.dtype != first.dtype for part in parts):
         raise LogError(f"{first.name}: the segments are of different layouts")
     return Topic(
-        first.name, first.channel, first.schema, first.dtype, lambda work: [r for part in parts for r in part.source(work)]
+        first.name,
+        first.channel,
+        first.schema,
+        first.dtype,
+        lambda work: [r for part in parts for r in part.source(work)],
     )
 
 
