@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-
 ULPS = 1_000_000  # beyond this many, units of the last place say nothing
 
 
