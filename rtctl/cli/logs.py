@@ -243,15 +243,15 @@ def _say(event: dict[str, Any], as_json: bool) -> None:
 def _state(record: Any) -> dict[str, Any]:
     import numpy as np
 
+    from rtctl.log.fields import called
     from rtctl.types import State, Status
 
     rho = record["rho"][np.isfinite(record["rho"])]
-    code, status = int(record["state"]), int(record["status"])
     return {
         "time_s": float(record["time"]),
         "tick": int(record["tick"]),
-        "state": State(code).name if code in State else str(code),
-        "status": Status(status).name.lower() if status in Status else str(status),
+        "state": called(State, int(record["state"])),
+        "status": called(Status, int(record["status"])).lower(),
         "x_m": record["x"].tolist(),
         "error_m": float(record["error"]),
         "clearance_m": float(rho.min()) if len(rho) else None,

@@ -6,7 +6,7 @@ import numpy as np
 
 from rtctl.errors import LogError
 from rtctl.log import schema
-from rtctl.log.fields import unit_of
+from rtctl.log.fields import called, unit_of
 from rtctl.log.run import Run
 from rtctl.types import F64, State, Status
 
@@ -86,7 +86,7 @@ def _figures(run: Run, topic: Any) -> dict[str, str]:
     near = rho[np.isfinite(rho)]
     step = np.linalg.norm(np.diff(topic.x, axis=0), axis=1).sum()
     speed = np.linalg.norm(topic.xd, axis=1).max()
-    states = "; ".join(State(s).name for s in _turns(topic.state) if s in State)
+    states = "; ".join(called(State, s) for s in _turns(topic.state))
     statuses = _turns(topic.status)
     arrived = sum(s == Status.ARRIVED for s in statuses)
     return {

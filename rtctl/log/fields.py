@@ -1,6 +1,7 @@
 """What the fields of a tick are, and in which unit: for people, axes, tables and units of files."""
 
 import struct
+from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,12 @@ FIELDS: dict[str, Field] = {
     "faults": Field("", "faults in force, bit i is control.faults.FAULTS[i]"),
     "model_evaluated": Field("", "1 where the model was evaluated anew"),
 }
+
+
+def called(kind: type[Enum], value: int) -> str:
+    """Return the name of an enum's value, the number where it has none: a log may be of another version."""
+    found = kind._value2member_map_.get(value)
+    return found.name if found is not None else str(value)
 
 
 def unit_of(name: str) -> str:

@@ -93,6 +93,10 @@ class Scene:
         """Return the name of the obstacle in a slot, '' for none."""
         return self._slots[slot] if 0 <= slot < len(self._slots) else ""
 
+    def shapes(self) -> list[dict[str, Any]]:
+        """Return the obstacles as they were last told."""
+        return [thing.shape for thing in self._things.values()]
+
     @staticmethod
     def can_show(record: Any) -> bool:
         """Return whether a record's numbers can be drawn: a log takes whatever bits a tick had."""
