@@ -35,8 +35,11 @@ def link_spec(config: Config) -> LinkSpec:
     )
 
 
-def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) -> Header:
-    """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included."""
+def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[int, ...] = (), **extra: str) -> Header:
+    """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included.
+
+    counters: of the link after the handshake.
+    """
     urdf = urdf_file(config.robot.urdf, path)
     text = urdf.read_text(encoding="utf-8")
     files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
@@ -49,7 +52,7 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) ->
         robot.dt,
         config=path.read_text(encoding="utf-8"),
         urdf=text,
-        extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), **extra},
+        extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
         files=files,
     )
 

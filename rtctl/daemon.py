@@ -84,7 +84,8 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         link = stack.enter_context(closing(_opened(config)))
         say(f"rtctl: {robot.name} on {config.link.interface}:{config.link.channel}, console {console.path}")
         greeting = link.handshake(listen=0.0 if lockstep else 1e-3 * config.link.listen_ms, recover=True)
-        recorder = _recorder(config, path, robot, greeting.q, dry=str(int(dry)))
+        extra = surroundings(config, greeting.watchdogs_written, dry)
+        recorder = _recorder(config, path, robot, greeting.q, link.counters, **extra)
         servo = Servo(robot, link, recorder, greeting.q, dry)
         console.publish(lambda: status(servo, recorder))
         if not lockstep:
@@ -126,11 +127,28 @@ def _opened(config: Config) -> CanLink:
     return CanLink(spec, transport)
 
 
-def _recorder(config: Config, path: Path, robot: Robot, q: np.ndarray, **extra: str) -> Recorder:
+def surroundings(config: Config, watchdogs: tuple[str, ...], dry: bool) -> dict[str, str]:
+    """Return what a log should tell of the machine and the handshake."""
+    clocksource = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    kernel = Path("/sys/kernel/realtime")
+    return {
+        "dry": str(int(dry)),
+        "realtime": config.loop.realtime,
+        "cpu": str(config.loop.cpu),
+        "priority": str(config.loop.priority),
+        "kernel_realtime": kernel.read_text().strip() if kernel.exists() else "no",
+        "clocksource": clocksource.read_text().strip() if clocksource.exists() else "unknown",
+        "watchdogs_written": ", ".join(watchdogs) or "none",
+    }
+
+
+def _recorder(
+    config: Config, path: Path, robot: Robot, q: np.ndarray, counters: tuple[int, ...], **extra: str
+) -> Recorder:
     log = config.log
     return Recorder.start(
         log.directory,
-        header_of(config, path, robot, q, **extra),
+        header_of(config, path, robot, q, counters, **extra),
         capacity=1 << (round(log.ring_MB * 1e6) - 1).bit_length(),
         segment_s=log.segment_s,
         segment_bytes=round(log.segment_MB * 1e6),

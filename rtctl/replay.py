@@ -4,6 +4,7 @@ The command frames are made anew by the daemon's own encoder, so that what is co
 """
 
 import hashlib
+import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -280,6 +281,7 @@ class _Wire:
         self._time: I64 = np.zeros(0, np.int64)
         self._ended = not compares
         self._primed = False
+        self._counted = _counters(run, len(link.spec.joints))
         self._joint = {joint.can_id: joint.name for joint in link.spec.joints}
         self._size = frame.CANFD_MTU if link.spec.fd else frame.CAN_MTU
 
@@ -298,6 +300,10 @@ class _Wire:
         if self._primed:
             return
         self._primed = True
+        if self._counted:
+            for j, counter in enumerate(self._counted):
+                self.link.set_counter(j, counter)
+            return
         self._fill(time)
         if not self.link.protected:
             return
@@ -342,6 +348,15 @@ class _Wire:
         size = f"bytes {', '.join(map(str, places))}" if places and ours and its else "a frame that the other lacks"
         joint = self._joint.get(can_id, f"{can_id:03X}")
         return Divergence(tick, tick * period, joint, "frame", its.hex() or "none", ours.hex() or "none", size)
+
+
+def _counters(run: Run, n: int) -> list[int]:
+    """Return the counters of the handshake that the header tells, [] when it does not."""
+    try:
+        found = [int(c) for c in json.loads(run.header.extra.get("counters", "[]"))]
+    except (ValueError, TypeError):
+        found = []
+    return found if len(found) == n else []
 
 
 def _first_gap(one: I64, two: I64) -> int:

@@ -219,7 +219,7 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
         if log is not None:
             from rtctl.log.writer import McapSink
 
-            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q))
+            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q, counters=link.counters))
         servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
         tally = Tally(robot)
         begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime)

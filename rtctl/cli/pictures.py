@@ -113,10 +113,10 @@ def _report(arguments: argparse.Namespace) -> int:
     run = read_run(arguments.file)
     out = Path(arguments.out) if arguments.out else Path(arguments.file).with_suffix(".html")
     with bar("reporting", 100) as progress:
-        write_report(run, out, progress)
+        found = write_report(run, out, progress)
         if arguments.png:
-            from rtctl.log.sheet import write_sheet
+            from rtctl.log.sheet import draw
 
-            write_sheet(run, Path(arguments.png))
+            draw(found, Path(arguments.png))
     print(out)
     return EXIT_OK

@@ -39,7 +39,7 @@ class Segment:
         self.size = size  # bytes that are whole; a torn write behind them is cut off
         self.pending = 0  # bytes of the chunk that is being filled
         self._chunk: list[Encoded] = []
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self.compressor = zstandard.ZstdCompressor(level=LEVEL)
 
     def add(self, encoded: Encoded) -> None:
         """Put messages into the current chunk; they reach the disk with `flush`."""
@@ -59,7 +59,7 @@ class Segment:
         bases = np.cumsum([0] + [len(e.data) for e in chunk[:-1]])
         offset = np.concatenate([e.offset + base for e, base in zip(chunk, bases, strict=True)])
         data = b"".join(e.data for e in chunk)
-        packed_data = self._compressor.compress(data)
+        packed_data = self.compressor.compress(data)
         start, end = int(time.min()), int(time.max())
         head = struct.pack("<QQQI", start, end, len(data), isal_zlib.crc32(data)) + struct.pack("<I4s", 4, b"zstd")
         head += struct.pack("<Q", len(packed_data))
