@@ -276,6 +276,7 @@ class _Wire:
         self.link = link
         self.frames = 0
         self.divergence: Divergence | None = None
+        compares = compares and any(run.count(schema.can_topic(bus)) for bus in run.header.buses[:1])
         self._sent = _sent_frames(run) if compares else iter(())
         self._waiting: Structured = np.zeros(0, CAN_ROW)
         self._time: I64 = np.zeros(0, np.int64)
