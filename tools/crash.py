@@ -231,6 +231,16 @@ def fill(folder: Path) -> dict[str, Any]:
     }
 
 
+def no_small_disk() -> str:
+    """Return why a file system of its own cannot be had, '' when it can."""
+    command = ["unshare", "-rm", "mount", "-t", "tmpfs", "-o", f"size={DISK}", "none", tempfile.gettempdir()]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return f"unshare: {error.strerror}"
+    return "" if done.returncode == 0 else f"unshare -rm mount -t tmpfs: {done.stderr.strip() or 'failed'}"
+
+
 def fill_small_disk() -> dict[str, Any]:
     """Run `fill` on a tmpfs of 2 MB in a mount namespace of its own. Raises RuntimeError where none can be had."""
     with tempfile.TemporaryDirectory(prefix="rtctl-disk-") as disk:

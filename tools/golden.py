@@ -57,8 +57,8 @@ def condensed(run: Run, path: Path) -> int:
     wanted = [c for c in channels(header) if c.topic in KEPT]
     rows: list[tuple[int, int, int, bytes]] = []
     for channel in wanted:
-        topic = run[channel.topic] if channel.topic in run else None
-        if topic is not None:
+        if channel.topic in run.topics:
+            topic = run[channel.topic]
             for time, number, payload in zip(topic.time.tolist(), topic.sequence.tolist(), topic.payloads, strict=True):
                 rows.append((time, channel.id, number, payload))
     rows.sort(key=lambda row: row[:2])

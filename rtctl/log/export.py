@@ -45,7 +45,10 @@ def to_csv(run: Run, topic: str, names: tuple[str, ...], out: IO[str], progress:
             if k == 0:
                 kind = piece.array.dtype
                 writer.writerow(["log_time_ns", *(t for name in chosen for t in titles(name, kind[name].shape))])
-            parts = [piece.array[name].reshape(len(piece), -1).tolist() for name in chosen]
+            parts = [
+                piece.array[name].reshape(len(piece), int(np.prod(piece.array.dtype[name].shape))).tolist()
+                for name in chosen
+            ]
             rows = (
                 (at, *(v for part in row for v in part)) for at, *row in zip(piece.time.tolist(), *parts, strict=True)
             )

@@ -35,7 +35,7 @@ class Link(NamedTuple):
     origin: F64  # (4, 4)
     axis: F64  # (3,)
     kind: str  # fixed | prismatic | anything that turns
-    index: int  # of q, -1 for one that is not configured: it stays at zero
+    joint: int  # of q, -1 for one that is not configured: it stays at zero
 
 
 class Thing(NamedTuple):
@@ -198,22 +198,22 @@ def _carriers(links: list[Link], n: int) -> list[list[Link]]:
     by_child = {link.child: link for link in links}
     chains: list[list[Link]] = [[] for _ in range(n + 1)]
     for link in links:
-        if link.index < 0:
+        if link.joint < 0:
             continue
         chain, at, seen = [link], link.parent, {link.child}
         while at in by_child and at not in seen:
             seen.add(at)
             chain.append(by_child[at])
             at = by_child[at].parent
-        chains[link.index + 1] = chain[::-1]
+        chains[link.joint + 1] = chain[::-1]
     return chains
 
 
 def _moved(link: Link, q: F64) -> F64:
     """Return the child in the parent (4, 4) at positions q."""
-    if link.index < 0 or link.kind == "fixed":
+    if link.joint < 0 or link.kind == "fixed":
         return link.origin
-    value, X = float(q[link.index]), np.eye(4)
+    value, X = float(q[link.joint]), np.eye(4)
     if link.kind == "prismatic":
         X[:3, 3] = value * link.axis
     else:
@@ -287,8 +287,8 @@ def _draw(entity: Any, thing: Thing, now: float, colour: tuple[float, ...]) -> N
     wxyz = shape.get("wxyz", (1, 0, 0, 0))
     paint = Color(r=colour[0], g=colour[1], b=colour[2], a=colour[3])
     if kind in ("point", "sphere", "ellipsoid", "n_ellipsoid"):
-        size = (a, a, a) if kind == "sphere" else (0.005,) * 3 if kind == "point" else (a, b, c)
-        _solid(entity.spheres.add(color=paint), p, wxyz, [2 * v for v in size])
+        half = (a, a, a) if kind == "sphere" else (0.005,) * 3 if kind == "point" else (a, b, c)
+        _solid(entity.spheres.add(color=paint), p, wxyz, [2 * v for v in half])
     elif kind in ("segment", "capsule"):
         radius = max(a, 0.003)
         R = _rotation(wxyz)

@@ -100,7 +100,8 @@ class Spectrum:
             return
         rows = values[: blocks * self.SIZE].reshape(blocks, self.SIZE, -1)
         rows = (rows - rows.mean(axis=1, keepdims=True)) * self._window[None, :, None]
-        self.power += self._norm * (np.abs(np.fft.rfft(rows, axis=1)) ** 2).sum(axis=0).T
+        power = (np.abs(np.fft.rfft(rows, axis=1)) ** 2).sum(axis=0).T
+        self.power += np.asarray(self._norm * power, np.float64)
         self.blocks += blocks
 
     @property

@@ -260,7 +260,7 @@ def _details(run: Run, g: Gathered) -> str:
         "servo": f"{1.0 / h.period:g} Hz",
         "config": h.config_sha256,
         "revision": h.revision or "-",
-        **{name: version for name, version in h.versions.items()},
+        **h.versions,
         **{name: value for name, value in h.extra.items() if name != "q_handshake"},
         **{name: str(count) + " messages" for name, count in ((t, run.count(t)) for t in run.topics) if count},
     }
