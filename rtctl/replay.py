@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -31,7 +31,7 @@ from rtctl.log.run import Run
 from rtctl.log.topic import CAN_ROW, Structured, stacked
 from rtctl.protocol import frame
 from rtctl.servo import first_feedback
-from rtctl.types import F64, I64, Command, Drive
+from rtctl.types import F64, I64, Command, Drive, Transport
 
 BLOCK = 1000  # ticks that are compared at once
 GIVEN = frozenset(("lateness", "compute"))  # copied through, never computed
@@ -136,7 +136,7 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     progress: called with the number of ticks done. Raises LogError, ConfigError.
     """
     what, robot = rebuilt(run) if config is None else other(config, run)
-    link = CanLink(link_spec(what), _Null())  # type: ignore[arg-type] - it only sends
+    link = CanLink(link_spec(what), cast(Transport, _Null()))
     dry = run.header.extra.get("dry") == "1"
     wire, check = _Wire(run, link, config is None), _Check(run)
     memory = initial(robot, first_feedback(_first_q(run)))

@@ -64,12 +64,12 @@ def condensed(run: Run, path: Path) -> int:
     rows.sort(key=lambda row: row[:2])
     pieces = [message(channel, number, time, payload) for time, channel, number, payload in rows]
     sizes = np.array([len(piece) for piece in pieces], np.int64)
-    columns = [np.array([row[i] for row in rows], np.int64) for i in (1, 2, 0)]
+    number_of, sequence, time_of = (np.array([row[i] for row in rows], np.int64) for i in (1, 2, 0))
     more = {"segment": "0", "session": path.stem, "clock_offset_ns": "0"}
     plain = header._replace(versions={}, revision="")  # kept in the index: the file changes with the law alone
     segment = begin(path, plain, tuple(wanted), 0, more)
     segment.compressor = zstandard.ZstdCompressor(level=LEVEL)
-    segment.add(Encoded(b"".join(pieces), *columns, np.cumsum(sizes) - sizes))
+    segment.add(Encoded(b"".join(pieces), number_of, sequence, time_of, np.cumsum(sizes) - sizes))
     segment.finish()
     return path.stat().st_size
 

@@ -58,7 +58,11 @@ def diff(a: Run, b: Run) -> Diff:
         gap = _gap(name, x, y, one.field("time")[rows])
         gaps += [gap] if gap else []
     both = ((a, one, rows), (b, two, others))
-    pick = lambda name: tuple(getattr(t, name)[r] for _, t, r in both)  # noqa: E731
+
+    def pick(name: str) -> tuple[F64, F64]:
+        left, right = (getattr(topic, name)[chosen] for _, topic, chosen in both)
+        return left, right
+
     tip, error, tau = pick("x"), pick("error"), pick("tau_sent")
     left, right = (_figures(run, topic) for run, topic, _ in both)
     summary = tuple((key, left.get(key, "-"), right.get(key, "-")) for key in {**left, **right})

@@ -163,7 +163,7 @@ class Encoder:
         return [self._said(INFO, text, time) for text in said]
 
     def _said(self, level: int, text: str, time: int) -> Encoded:
-        message = Log(level=level, message=text, name="rtctl")
+        message = Log(level=Log.Level.Name(level), message=text, name="rtctl")
         stamp = time + self.offset
         message.timestamp.seconds, message.timestamp.nanos = stamp // 1_000_000_000, stamp % 1_000_000_000
         return self._message(schema.LOG, time, message.SerializeToString(deterministic=True))
@@ -358,7 +358,9 @@ def _plain(values: np.ndarray[Any, Any]) -> Any:
     """Return numbers for JSON, which has no infinities: those become null."""
     if values.dtype.kind != "f":
         return values.tolist()
-    return np.where(np.isfinite(values), values.astype(object), None).tolist()
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
 
 
 def _assembled(

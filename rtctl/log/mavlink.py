@@ -37,7 +37,7 @@ class Listing(NamedTuple):
     component: int
     message: int
     name: str
-    count: int
+    packets: int
     hz: float
     lost: int  # packets of this sender on this link that never came, by the holes in their numbers
 

@@ -99,9 +99,9 @@ class Spectrum:
         if not blocks or values.shape[1] != len(self.power) or not np.isfinite(values).all():
             return
         rows = values[: blocks * self.SIZE].reshape(blocks, self.SIZE, -1)
-        rows = (rows - rows.mean(axis=1, keepdims=True)) * self._window[None, :, None]
-        power = (np.abs(np.fft.rfft(rows, axis=1)) ** 2).sum(axis=0).T
-        self.power += np.asarray(self._norm * power, np.float64)
+        centred = (rows - rows.mean(axis=1, keepdims=True)) * self._window[None, :, None]
+        power = (np.abs(np.fft.rfft(centred, axis=1)) ** 2).sum(axis=0).T
+        self.power = self.power + np.asarray(self._norm * power, np.float64)
         self.blocks += blocks
 
     @property

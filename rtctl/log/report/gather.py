@@ -303,12 +303,12 @@ def _bus_load(run: Run, topic: str, header: Header, width: float = 0.1) -> tuple
     def work(part: Part) -> F64:
         size = np.clip(part.size - schema.CAN_DATA_AT, 0, len(cost) - 1)
         place = np.clip((part.time - start) // round(width * 1e9), 0, count - 1)
-        return np.bincount(place, cost[size], count)
+        return np.asarray(np.bincount(place, cost[size], count), np.float64)
 
     load = np.zeros(count)
     for each in run[topic].source(work):
         load += each
-    return np.arange(count) * width, load / width
+    return np.asarray(np.arange(count) * width), load / width
 
 
 def _event(event: dict[str, Any]) -> tuple[float, str, str]:

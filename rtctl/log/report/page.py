@@ -138,7 +138,10 @@ def plots(g: Gathered) -> list[dict[str, Any]]:
         lines = [] if tau_max is None or len(tau_max) <= i else [float(tau_max[i]), -float(tau_max[i])]
         series = [(f"tau_measured.{joint}", "measured", 7, False), (f"tau_sent.{joint}", "sent", i, False)]
         plot(f"tau-{i}", f"Torque of {joint}", "Nm", series, lines=lines, group="Torque", small=True)
-    each = lambda field: [(f"{field}.{joint}", joint, i, False) for i, joint in enumerate(joints)]  # noqa: E731
+
+    def each(field: str) -> list[tuple[str, str, int, bool]]:
+        return [(f"{field}.{joint}", joint, i, False) for i, joint in enumerate(joints)]
+
     plot("q", "Joint positions", "rad", each("q"), group="Joints")
     plot("qd", "Joint speeds", "rad/s", each("qd"), group="Joints")
     plot("margin", "Margin to the joint limits", "rad", each("margin"), zero=True, group="Joints")
@@ -187,9 +190,8 @@ def _thinned(path: list[list[float]], most: int = 200) -> list[list[float]]:
 def _tip(g: Gathered) -> dict[str, Any]:
     if not {"x.x", "x.y", "x.z"} <= set(g.bins.names):
         return {"path": [], "goals": []}
-    middle = lambda name: np.mean(g.bins.series(name), axis=0)  # noqa: E731
     step = max(1, len(g.bins.time) // TIP_POINTS)
-    path = np.stack([middle(f"x.{a}") for a in XYZ], axis=1)[::step]
+    path = np.stack([np.mean(g.bins.series(f"x.{a}"), axis=0) for a in XYZ], axis=1)[::step]
     rows = [
         [round(t, 3), *(round(v, 4) for v in p)]
         for t, p in zip(g.bins.time[::step].tolist(), path.tolist(), strict=True)
