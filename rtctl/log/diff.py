@@ -49,7 +49,7 @@ def diff(a: Run, b: Run) -> Diff:
     one, two = (run[schema.TICK].load("time", "slot", *names) for run in (a, b))
     if not len(one) or not len(two):
         raise LogError(f"{(b if len(one) else a).path}: no tick in it")
-    _, rows, others = np.intersect1d(one.slot, two.slot, assume_unique=True, return_indices=True)
+    _, rows, others = np.intersect1d(one.slot, two.slot, return_indices=True)
     gaps = []
     for name in names:
         x, y = getattr(one, name)[rows], getattr(two, name)[others]

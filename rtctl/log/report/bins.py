@@ -87,7 +87,7 @@ class Spectrum:
     SIZE = 1024
 
     def __init__(self, n: int, rate: float) -> None:
-        self.frequency: F64 = np.fft.rfftfreq(self.SIZE, 1.0 / rate)
+        self.frequency: F64 = np.asarray(np.fft.rfftfreq(self.SIZE, 1.0 / rate), np.float64)
         self.power: F64 = np.zeros((n, len(self.frequency)))
         self.blocks = 0
         self._window = np.hanning(self.SIZE)
