@@ -11,14 +11,19 @@ FORMATS = ("csv", "parquet", "candump", "blf", "tlog")
 ENDINGS = {".csv": "csv", ".parquet": "parquet", ".log": "candump", ".blf": "blf", ".tlog": "tlog"}
 EXPORT_EXAMPLE = """rtctl log export run.mcap --fields time,x,rho > run.csv
   rtctl log export run.mcap --out run.parquet
-  rtctl log export run.mcap --out run.log         # candump: canplayer, Wireshark, python-can
+  rtctl log export run.mcap --out run.log
   rtctl log export run.mcap --out run.blf
-  rtctl log export rover.mcap --out flight.tlog   # MAVLink: Mission Planner, MAVExplorer"""
+  rtctl log export rover.mcap --out flight.tlog"""
+
+
+EXPORT_TEXT = """Write a log in another program's format: a topic as CSV or Parquet (units are metadata of its columns);
+CAN frames as candump's .log (canplayer, python-can, Wireshark) or Vector's .blf; MAVLink packets as .tlog."""
 
 
 def add(actions: Commands) -> None:
     """Add the three commands."""
     export = command(actions, "export", "write a log in another program's format", EXPORT_EXAMPLE, _export)
+    export.description = EXPORT_TEXT
     export.add_argument("file", metavar="FILE")
     export.add_argument("--out", metavar="FILE", default="-", help="default: standard output, for csv and candump")
     export.add_argument("--format", choices=FORMATS, default="", help="default: by the ending of --out, else csv")

@@ -5,8 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rtctl.cli.parser import Commands, command
 from rtctl.cli.progress import bar
 from rtctl.errors import EXIT_FAILED, EXIT_OK
@@ -65,6 +63,8 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 
 def _as_dict(done: Any, other: Path | None) -> dict[str, Any]:
+    import numpy as np
+
     gap = done.replayed - done.logged
     return {
         "identical": done.identical,
@@ -81,6 +81,8 @@ def _as_dict(done: Any, other: Path | None) -> dict[str, Any]:
 
 
 def _text(done: Any, other: Path | None, run: Any) -> str:
+    import numpy as np
+
     from rtctl.cli.logs import table
 
     lines = [f"{done.ticks} ticks, {done.frames} command frames, {done.speed:.1f} x real time"]

@@ -1,9 +1,11 @@
 """Logs: written as MCAP so that nothing is lost, read as arrays.
 
     tick = rtctl.log.read("run.mcap")["/tick"]
-    tick.q          # (N, n) [rad]   positions that the drives replied      tick.tau_sent  # (N, n) [Nm] after the limits
-    tick.x          # (N, 3) [m]     tip position, world frame              tick.rho       # (N, K) [m] to each obstacle
-    tick.time       # (N,) [ns]      log_time; `tick.field("time")` is robot time [s]
+    tick.q          # (N, n) [rad]  positions that the drives replied
+    tick.tau_sent   # (N, n) [Nm]   torque that was sent, after the limits
+    tick.x          # (N, 3) [m]    tip position, world frame
+    tick.rho        # (N, K) [m]    distance to each obstacle slot
+    tick.time       # (N,) [ns]     log_time; `tick.field("time")` is robot time [s]
 
 `rtctl.log.fields.FIELDS` has the unit and meaning of every field, `rtctl log plot FILE --list` prints them. `read_run`
 reads all segments of a run as one; docs/read_a_log.py is an example.

@@ -20,8 +20,8 @@ from rtctl.log.header import Header, header_from_json, of_attachment
 from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.log.segment import INFO, OPEN
 from rtctl.log.summary import INDEX_ENTRY
-from rtctl.log.topic import Part, Topic, rows_of
-from rtctl.log.walk import I64_MAX, MESSAGE, RECORD, Damaged, Source, chunk_data, chunk_head, chunk_messages
+from rtctl.log.topic import Part, Topic
+from rtctl.log.walk import I64_MAX, MESSAGE, RECORD, Damaged, Source, chunk_data, chunk_head, chunk_messages, rows_of
 from rtctl.log.walk import message_index as index_entries
 from rtctl.types import I64
 

@@ -11,7 +11,7 @@ from mcap import records
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.schema import Layout, can_layout, tick_layout
-from rtctl.log.walk import Source
+from rtctl.log.walk import Source, rows_of
 from rtctl.types import I64, U8
 
 Structured = np.ndarray[Any, np.dtype[np.void]]
@@ -43,14 +43,6 @@ class Part(NamedTuple):
 
 
 Mapped = Callable[[Callable[[Part], Any]], list[Any]]  # applies a function to each part, gives the results in order
-
-
-def rows_of(raw: U8, at: I64, size: int) -> U8:
-    """Return `size` bytes from each of the places `at`, (len(at), size)."""
-    if not len(at) or not size:
-        return np.zeros((len(at), size), np.uint8)
-    every: U8 = np.ndarray((len(raw) - size + 1, size), np.uint8, raw, 0, (1, 1))  # as_strided takes ten times as long
-    return every[at]
 
 
 class Topic:
