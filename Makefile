@@ -2,6 +2,7 @@
 # make test    install everything, lint, all tests
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
+# make stress  500 random scenarios over the robots, judged by pybullet: about an hour
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -12,7 +13,7 @@ SYSTEM := $(VENV)/.system
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint bench install lock clean
+.PHONY: demo test lint bench stress install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -28,6 +29,9 @@ lint: install
 
 bench: install
 	$(BIN)/python -m tools.bench
+
+stress: install
+	$(BIN)/python -m tools.stress
 
 install: $(INSTALLED) $(SYSTEM)
 

@@ -200,9 +200,13 @@ def _scenario(path: str | None) -> dict[str, Any]:
         return {}
     try:
         with open(path, "rb") as file:
-            return tomllib.load(file)
+            scenario = tomllib.load(file)
     except (OSError, ValueError) as error:
         raise SettingsError(f"{path}: {error}") from error
+    for table in scenario.get("obstacle", ()):
+        if "file" in table:  # relative to the file that names it
+            table["file"] = os.path.join(os.path.dirname(os.path.abspath(path)), table["file"])
+    return scenario
 
 
 def run(args: argparse.Namespace) -> None:

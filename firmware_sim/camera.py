@@ -2,28 +2,40 @@
 
 import json
 import socket
+import struct
 from typing import Any
 
 from firmware_sim.drive import NS
-from firmware_sim.shapes import Shape, Solid, shape_at
+from firmware_sim.shapes import Shape, Solid, reported, shape_at
 
 PERIOD_NS = 20_000_000  # of simulated time
+CLOUD_PERIOD_NS = 33_333_333
+CLOUD_MARK = b"RTCLOUD1"
 RETRY_NS = 500_000_000
 DROPPED_KEYS = frozenset(
-    ("waypoints", "appears_s", "vanishes_s", "rpy_rad", "normal", "file", "scale", "position_m", "velocity_m_s")
-)
+    ("waypoints", "appears_s", "vanishes_s", "rpy_rad", "normal", "file", "scale", "hull", "voxel_m", "position_m",
+     "velocity_m_s")
+)  # fmt: skip
 
 
 def seen(obstacle: Solid, shape: Shape) -> dict[str, Any]:
     """Return an obstacle as a message tells it: where it is now, and how it moves."""
     table = {k: v for k, v in obstacle.spec.items() if k not in DROPPED_KEYS}
-    if obstacle.spec["type"] == "mesh":
-        table |= {"type": "box", "size_m": (2.0 * shape.dims[:3]).tolist()}
+    if obstacle.mesh is not None and "mesh" not in table:  # a file that the controller's config does not name
+        table |= {"type": "box", "size_m": obstacle.mesh.size.tolist()}
     return table | {
         "position_m": shape.position.tolist(),
         "wxyz": [min(max(float(v), -1.0), 1.0) for v in shape.wxyz],
         "velocity_m_s": shape.velocity.tolist(),
     }
+
+
+def cloud(obstacle: Solid, shape: Shape) -> bytes:
+    """Return a cloud as its binary message: the mark, the length of a JSON header, the header, int16 x y z a point."""
+    told = reported(obstacle, shape)
+    table = seen(obstacle, told) | {"point_radius_m": float(told.dims[0])}
+    header = json.dumps({"verb": "cloud", "set": table, "step_m": float(told.dims[1]), "feed": True}).encode()
+    return CLOUD_MARK + struct.pack("<I", len(header)) + header + told.cloud
 
 
 class Camera:
@@ -36,6 +48,7 @@ class Camera:
         self._socket: socket.socket | None = None
         self._next_ns = self._retry_ns = 0
         self._shown: set[str] = set()
+        self._next_cloud_ns = 0
 
     def tick(self, now_ns: int, scene_ns: int) -> None:
         """Send one frame if it is time; `now_ns` paces, `scene_ns` is the scenario's clock."""
@@ -49,8 +62,13 @@ class Camera:
             return
         self._read()
         shapes = [(o, shape_at(o, scene_ns / NS)) for o in self.obstacles]
-        present = [seen(o, s) for o, s in shapes if s is not None]
-        names = {str(t["name"]) for t in present}
+        present = [seen(o, s) for o, s in shapes if s is not None and o.scan is None]
+        names = {o.name for o, s in shapes if s is not None}
+        if now_ns >= self._next_cloud_ns:
+            self._next_cloud_ns = now_ns + CLOUD_PERIOD_NS
+            for o, s in shapes:
+                if o.scan is not None and s is not None:
+                    self._send(cloud(o, s))
         message: dict[str, Any] = {"verb": "obstacles", "set": present}
         if self._shown - names:
             message["clear"] = sorted(self._shown - names)

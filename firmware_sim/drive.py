@@ -135,6 +135,7 @@ class Drive:
         self.release_ns = -1  # since the first torque command after enable, -1 = none yet
         self.command = codec.Command(0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.torque = 0.0  # [Nm] applied
+        self.strength = 1.0  # of the motor: less than it is told when a fault makes it so
         self.flags = 0  # clamped, slewed, derated of the last actuation
         self.silence_ns = 0
         self.fault_age_ns = 0
@@ -318,7 +319,7 @@ class Drive:
         self.flags = codec.DERATED if derate < 1.0 else 0
         if abs(wanted) > limit + self.scale.t / 4095.0:  # half an LSB over the limit is rounding, not a demand
             self.flags |= codec.CLAMPED
-        wanted = min(max(wanted, -limit), limit)
+        wanted = min(max(wanted, -limit), limit) * self.strength
         self.slew_budget = min(self.slew_budget + self.slew * dt, self.slew_bound)
         change = wanted - self.torque
         if abs(change) > self.slew_budget:

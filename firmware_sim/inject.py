@@ -22,7 +22,9 @@ KINDS = {
     "duplicate": "every reply comes twice",
     "corrupt_crc": "one bit of every reply is flipped",
     "corrupt_command": "one bit of every command is flipped",
+    "weak": "the drive gives half the torque it is told, and says nothing of it",
     "stuck_encoder": "the encoder repeats its last value",
+    "false_velocity": "the encoder's speed reads 1 rad/s too high",
     "encoder_jump": "the encoder is off by 0.5 rad",
     "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
 }
@@ -115,6 +117,8 @@ class Injector:
         if self.active("stuck_encoder", now, joint):
             return self.stuck.setdefault(joint, (q, qd))
         self.stuck.pop(joint, None)
+        if self.active("false_velocity", now, joint):
+            return q, qd + 1.0
         return (q + JUMP, qd) if self.active("encoder_jump", now, joint) else (q, qd)
 
     def apply(self, now: int, drives: Sequence[Drive]) -> None:
@@ -132,5 +136,7 @@ class Injector:
                     drive.temperature = 125.0
                 elif f.kind == "hot":
                     drive.temperature = 110.0
+                elif f.kind == "weak":
+                    drive.strength = 0.5
                 elif f.kind == "reboot":
                     drive.boot()

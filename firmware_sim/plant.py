@@ -29,6 +29,8 @@ STEP_NS = 500_000  # longest physics step
 STOP = 0.1  # [rad or m] mechanical stop outside the permitted range
 SIGHT = 0.5  # [m] clearances are measured up to here; farther counts as this
 SELF_SIGHT = 0.1  # [m] the same between links of the arm
+BEYOND = SIGHT + 0.1  # [m] clouds are looked for up to here, so that far ones need not be measured every time
+LEVER = 2.0  # [m] no point of the arm is further from the axis of any of its joints
 FASTEST = 10.0  # [m/s] no two links of an arm close faster
 NEAR, TOUCH = 0.1, 1e-3  # [m] see Plant._pairs
 MARGIN = 0.0
@@ -43,6 +45,9 @@ class Contact(NamedTuple):
     link: str
     other: str
     cause: str  # "arm" | "obstacle" | "self"
+    arm_m_s: float = 0.0  # speed with which the arm's own point came towards the obstacle, just before they met
+    other_m_s: float = 0.0  # and the obstacle's towards the arm
+    row: tuple[float, ...] = ()  # d gap/d q (n,) of the arm's point [m/rad]
 
 
 def rewrite(settings: Settings) -> str:
@@ -99,13 +104,17 @@ class Plant:
         self.step_ns = settings.period_ns // n_steps
         self.substeps = n_steps
         self._engine()
-        self.body = self._load(rewrite(settings))
+        urdf = rewrite(settings)
+        self.body = self._load(urdf)
         self._identify()
+        self._inertias(urdf)
         self.time_ns = 0
         self.scene_ns = 0  # time on the scenario's clock: where the obstacles are
         self.solids = [solid(dict(o), settings) for o in obstacles]
         self.bodies: dict[str, int] = {}
         self.poses: dict[str, tuple[float, ...]] = {}
+        self.scans = {s.name: s.scan.radius for s in self.solids if s.scan is not None}
+        self.cloud_seen: dict[str, tuple[float, float, list[float], int]] = {}  # distance, least so far, q, time [ns]
         self.touching: set[tuple[str, str]] = set()
         self.contacts: list[Contact] = []
         self.drag = [-1.0] * len(self.index)
@@ -136,7 +145,7 @@ class Plant:
                 file.write(urdf)
             try:
                 with silent():
-                    flags = pb.URDF_USE_INERTIA_FROM_FILE
+                    flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_IMPLICIT_CYLINDER
                     return int(pb.loadURDF(path, useFixedBase=True, flags=flags, physicsClientId=self.client))
             except pb.error as error:
                 raise SettingsError(f"{self.settings.urdf}: {error}") from error
@@ -169,6 +178,29 @@ class Plant:
             pb.setJointMotorControl2(self.body, i, pb.VELOCITY_CONTROL, force=0.0, physicsClientId=self.client)
         self.moving = frozenset(i for i in self.links if self._chain(i))
         self.armature = np.array([j.armature for j in self.settings.joints])
+        self.friction = np.array([j.friction for j in self.settings.joints])
+        self.motors = bool(self.armature.any() or self.friction.any())
+
+    def _inertias(self, urdf: str) -> None:
+        """Give links the tensor of the URDF where pybullet replaced it by zero.
+
+        It does so, with no more than a warning, where the largest moment is more than the sum of the others: published
+        identifications have such links.
+        """
+        frames = {name: i for i, name in self.links.items()}
+        for link in ET.fromstring(urdf).findall("link"):
+            tensor = link.find("inertial/inertia")
+            i = frames.get(link.get("name", ""), -1)
+            if tensor is None or i < 0:
+                continue
+            wanted = [float(tensor.get(k, "0")) for k in ("ixx", "iyy", "izz")]
+            if not any(wanted) or any(pb.getDynamicsInfo(self.body, i, physicsClientId=self.client)[2]):
+                continue
+            if any(float(tensor.get(k, "0")) for k in ("ixy", "ixz", "iyz")):
+                raise SettingsError(
+                    f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor"
+                )
+            pb.changeDynamics(self.body, i, localInertiaDiagonal=wanted, physicsClientId=self.client)
 
     def _joints(self) -> int:
         return int(pb.getNumJoints(self.body, physicsClientId=self.client))
@@ -192,8 +224,8 @@ class Plant:
 
         Drag is a velocity motor towards zero speed with a bounded force: it brakes and holds, and never drives.
         """
-        if self.armature.any():
-            torque = self._with_armature(torque)
+        if self.motors:
+            torque = self._with_motors(torque)
         pb.setJointMotorControlArray(
             self.body, self.index, pb.TORQUE_CONTROL, forces=torque, physicsClientId=self.client
         )
@@ -212,14 +244,14 @@ class Plant:
         self.time_ns += self.step_ns
         self._read()
 
-    def _with_armature(self, torque: Sequence[float]) -> list[float]:
-        """Return the torques that move the arm as if each joint also carried its motor's inertia.
+    def _with_motors(self, torque: Sequence[float]) -> list[float]:
+        """Return the torques that move the arm as if each joint also carried its motor's inertia and friction.
 
-        (A + diag(J G^2)) qdd = tau - h - g; pybullet, which knows A alone, gets tau - J G^2 qdd.
+        (A + diag(J G^2)) qdd = tau - B G^2 qd - h - g; pybullet, which knows A alone, gets tau - B G^2 qd - J G^2 qdd.
         """
         A = np.array(pb.calculateMassMatrix(self.body, self.q, physicsClientId=self.client))
         bias = pb.calculateInverseDynamics(self.body, self.q, self.qd, [0.0] * len(self.q), physicsClientId=self.client)
-        tau = np.asarray(torque, dtype=np.float64)
+        tau = np.asarray(torque, dtype=np.float64) - self.friction * np.array(self.qd)
         qdd = np.linalg.solve(A + np.diag(self.armature), tau - np.array(bias))
         result: list[float] = (tau - self.armature * qdd).tolist()
         return result
@@ -239,6 +271,7 @@ class Plant:
                 continue
             shape = shape_at(obstacle, t)
             if shape is None:
+                self.cloud_seen.pop(obstacle.name, None)
                 pb.removeBody(self.bodies.pop(obstacle.name), physicsClientId=self.client)
                 continue
             w, x, y, z = shape.wxyz
@@ -261,34 +294,72 @@ class Plant:
         """Count rising edges of contact, per link and obstacle."""
         now: set[tuple[str, str]] = set()
         for name, body in self.bodies.items():
+            if name in self.scans:
+                continue  # the engine knows their centres alone; see _cloud_clearance
             for point in pb.getContactPoints(self.body, body, physicsClientId=self.client):
                 if point[3] not in self.moving or point[8] > 0.0:
                     continue
                 pair = (self.links[point[3]], name)
                 if pair not in now and pair not in self.touching:
-                    self.contacts.append(Contact(self.time_ns / NS, *pair, self._cause(point, name)))
+                    self.contacts.append(self._met(point, name))
                 now.add(pair)
         self.touching = now | {pair for pair in self.touching if pair[1].startswith("self:")}
 
-    def _cause(self, point: tuple[Any, ...], name: str) -> str:
-        """Tell who closed the gap: the side whose surface moved faster along the normal before they met."""
+    def _met(self, point: tuple[Any, ...], name: str) -> Contact:
+        """Return the contact: whose surface moved faster along the normal before they met closed the gap."""
         q, qd = self._before  # the impact has changed the arm's speed already
         com, turned = pb.getLinkState(self.body, point[3], physicsClientId=self.client)[:2]
         local, _ = pb.multiplyTransforms(*pb.invertTransform(com, turned), point[5], (0.0, 0.0, 0.0, 1.0))
         rows = pb.calculateJacobian(self.body, point[3], local, q, qd, [0.0] * len(q), physicsClientId=self.client)
-        velocity = np.array(rows[0]) @ np.array(qd)
         normal = np.array(point[7])  # from the obstacle to the arm
+        row = normal @ np.array(rows[0])
+        own = -float(row @ np.array(qd))
         shape = shape_at(next(s for s in self.solids if s.name == name), self.scene_ns / NS)
-        own = 0.0 if shape is None else float(normal @ shape.velocity)
-        return "obstacle" if own > -float(normal @ velocity) else "arm"
+        other = 0.0
+        if shape is not None:
+            other = float(normal @ (shape.velocity + np.cross(shape.omega, np.array(point[6]) - shape.position)))
+        cause = "obstacle" if other > own else "arm"
+        return Contact(self.time_ns / NS, self.links[point[3]], name, cause, own, other, tuple(row.tolist()))
 
     def clearances(self) -> dict[str, float]:
         """Return the smallest distance of any moving link to each obstacle present [m], at most SIGHT."""
         found: dict[str, float] = {}
         for name, body in self.bodies.items():
+            if name in self.scans:
+                found[name] = self._cloud_clearance(name, body)
+                continue
             points = pb.getClosestPoints(self.body, body, SIGHT, physicsClientId=self.client)
             found[name] = min((p[8] for p in points if p[3] in self.moving), default=SIGHT)
         return found
+
+    def _cloud_clearance(self, name: str, body: int) -> float:
+        """Return the smallest distance of any moving link to the balls of a cloud [m], at most SIGHT.
+
+        Measured when what has moved since could have brought a link nearer than ever before; until then as it was:
+        thousands of specks take pybullet milliseconds, and the smallest clearance is missed by nothing.
+        """
+        radius = self.scans[name]
+        last, least, turned, then = self.cloud_seen.get(name, (0.0, np.inf, self.q, self.time_ns))
+        shape = shape_at(next(s for s in self.solids if s.name == name), self.scene_ns / NS)
+        fast = (
+            0.0 if shape is None else float(np.linalg.norm(shape.velocity) + 2.0 * LEVER * np.linalg.norm(shape.omega))
+        )
+        moved = LEVER * float(np.abs(np.subtract(self.q, turned)).sum()) + fast * (self.time_ns - then) / NS
+        if name in self.cloud_seen and last - moved > min(least, SIGHT):
+            return min(last, SIGHT)
+        points: Sequence[tuple[Any, ...]] = ()
+        sight = max(last + 2.0 * moved, 0.02) + radius
+        while not points and sight < 2.0 * (BEYOND + radius):  # near first: few specks are within a small sight
+            points = pb.getClosestPoints(self.body, body, min(sight, BEYOND + radius), physicsClientId=self.client)
+            points = [p for p in points if p[3] in self.moving]
+            sight *= 2.0
+        nearest = min(points, key=lambda p: p[8], default=None)
+        distance = BEYOND if nearest is None else float(nearest[8]) - radius
+        pair = (self.links[nearest[3]] if nearest is not None else "", name)
+        if distance <= 0.0 and nearest is not None and least > 0.0 and pair not in self.touching:
+            self.contacts.append(self._met(nearest, name))
+        self.cloud_seen[name] = distance, min(least, distance), list(self.q), self.time_ns
+        return min(distance, SIGHT)
 
     def self_clearance(self) -> float:
         """Return the smallest distance between links that are not neighbours [m], at most SELF_SIGHT."""

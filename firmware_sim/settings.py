@@ -38,12 +38,14 @@ class JointSetting(NamedTuple):
     q_min: float  # [rad] permitted range; the mechanical stops lie outside it
     q_max: float
     armature: float  # [kg m^2] motor inertia seen at the joint
+    friction: float  # [Nms/rad] viscous, seen at the joint
 
 
 class Settings(NamedTuple):
     """The robot file, as far as drives, plant and bus need it."""
 
     name: str
+    folder: Path  # of the file: its own paths are relative to it
     urdf: Path
     package_dirs: tuple[Path, ...]
     tip_frame: str
@@ -58,6 +60,7 @@ class Settings(NamedTuple):
     fd: bool
     e2e: bool
     obstacles: tuple[dict[str, Any], ...]
+    meshes: tuple[dict[str, Any], ...]
     socket: str | None
 
 
@@ -129,13 +132,20 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
     }
     return Settings(
         name=robot["name"],
+        folder=path.parent,
         urdf=resolve(robot["urdf"], path.parent, packages),
         package_dirs=packages,
         tip_frame=robot["tip_frame"],
         base_position=tuple(map(float, base.get("position_m", (0.0, 0.0, 0.0)))),  # type: ignore[arg-type]
         base_wxyz=quaternion(base),
         joints=tuple(
-            JointSetting(j["name"], float(j["q_min_rad"]), float(j["q_max_rad"]), float(j.get("armature_kg_m2", 0.0)))
+            JointSetting(
+                j["name"],
+                float(j["q_min_rad"]),
+                float(j["q_max_rad"]),
+                float(j.get("armature_kg_m2", 0.0)),
+                float(j.get("friction_Nms_rad", 0.0)),
+            )
             for j in robot["joints"]
         ),
         ratings=tuple(_rating(j, scales, common) for j in robot["joints"]),
@@ -146,6 +156,7 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
         fd=bool(link["fd"]),
         e2e=link["protocol"] == "mit+e2e",
         obstacles=tuple(file.get("obstacle", ())),
+        meshes=tuple(file.get("mesh", ())),
         socket=file.get("console", {}).get("socket"),
     )
 

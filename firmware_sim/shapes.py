@@ -2,7 +2,8 @@
 
 Spheres, capsules, boxes and cylinders are pybullet's own shapes. The others become convex hulls of vertices that lie on
 the surface, so a hull never reaches beyond the true shape: measured clearances are never too small, and too large by
-at most `tolerance` (`HULL_TOLERANCE` of the largest semi-axis, held by a test).
+at most `tolerance` (`HULL_TOLERANCE` of the largest semi-axis, held by a test). A mesh is pybullet's own reading of its
+file: its triangles, hollow to the engine, or its hull. A cloud is a mesh of specks, see `scan`.
 """
 
 import math
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_sim.bullet import pb, silent
+from firmware_sim.scan import Scan, load_scan, specks
 from firmware_sim.settings import Settings, SettingsError, quaternion, resolve
 
 F64 = NDArray[np.float64]
@@ -33,6 +35,9 @@ class Shape(NamedTuple):
     wxyz: F64  # (4,)
     velocity: F64  # (3,) [m/s]
     omega: F64  # (3,) [rad/s]
+    group: str = ""
+    mesh: str = ""
+    cloud: bytes = b""
 
 
 class ObstacleEdit(NamedTuple):
@@ -41,6 +46,16 @@ class ObstacleEdit(NamedTuple):
     name: str
     shape: Shape | None
     age: float = 0.0
+    feed: bool = False
+
+
+class MeshFile(NamedTuple):
+    """Where a mesh comes from."""
+
+    path: str
+    scale: float
+    hull: bool
+    size: F64  # (3,) [m] of the box about its own origin that holds it
 
 
 class Solid(NamedTuple):
@@ -55,6 +70,10 @@ class Solid(NamedTuple):
     vanishes: float  # [s]
     vertices: F64  # (k, 3) of the hull, (0, 3) for pybullet's own shapes
     still: bool  # never moves
+    group: str  # the union it is a part of, "" for none
+    mesh: MeshFile | None = None
+    key: str = ""  # of the mesh, as the controller knows it
+    scan: Scan | None = None
 
 
 def multiply(a: F64, b: F64) -> F64:
@@ -66,27 +85,37 @@ def multiply(a: F64, b: F64) -> F64:
 def solid(spec: dict[str, Any], settings: Settings) -> Solid:
     """Return the obstacle that a scenario's table describes; SettingsError for a type nobody knows."""
     kind = spec["type"]
-    dims, vertices = _geometry(kind, spec, settings)
+    dims, vertices = _geometry(kind, spec)
+    mesh = _mesh(spec, settings) if kind == "mesh" else None
+    scan = None
+    if kind == "cloud":
+        path = resolve(spec["file"], settings.folder, settings.package_dirs)
+        scan = load_scan(path, float(spec["point_radius_m"]), spec["name"])
+        dims = scan.reported, scan.step
     return Solid(
         spec=spec,
         name=spec["name"],
-        type="box" if kind == "mesh" else kind,
+        type=kind,
         dims=np.array((*dims, 0.0, 0.0, 0.0, 0.0)[:4], dtype=np.float64),
         wxyz=np.array(quaternion(spec)),
         appears=float(spec.get("appears_s", 0.0)),
         vanishes=float(spec.get("vanishes_s", 1e6)),
         vertices=vertices,
         still=not spec.get("waypoints") and not any((*spec.get("velocity_m_s", ()), *spec.get("omega_rad_s", ()))),
+        group="" if spec.get("combine") == "sum" else spec.get("group", ""),
+        mesh=mesh,
+        key=(spec.get("mesh") or "@" + spec["name"]) if mesh else "",
+        scan=scan,
     )
 
 
-def _geometry(kind: str, spec: dict[str, Any], settings: Settings) -> tuple[tuple[float, ...], F64]:
+def _geometry(kind: str, spec: dict[str, Any]) -> tuple[tuple[float, ...], F64]:
     """Return the dimensions in the controller's order and the hull's vertices."""
     none = np.zeros((0, 3))
     radius = float(spec.get("radius_m", 0.0))
     if kind == "sphere":
         return (radius,), none
-    if kind in ("point", "plane"):
+    if kind in ("point", "plane", "mesh", "cloud"):
         return (), none
     if kind in ("capsule", "segment", "cylinder"):
         return (radius, 0.5 * float(spec["length_m"])), none
@@ -101,8 +130,6 @@ def _geometry(kind: str, spec: dict[str, Any], settings: Settings) -> tuple[tupl
             return axes, superquadric(axes, (2.0, 2.0, 2.0))
         n = float(spec["n"])
         return (*axes, n), superquadric(axes, (2.0 * n if kind == "n_ellipsoid" else 2.0,) * 2 + (2.0 * n,))
-    if kind == "mesh":
-        return _mesh(spec, settings)
     raise SettingsError(f"obstacle {spec.get('name')}: type {kind} is none of the known ones")
 
 
@@ -131,21 +158,25 @@ def frustum(bottom: float, top: float, half: float) -> F64:
     return np.concatenate((low, np.concatenate((ring * top, np.full((SIDES, 1), half)), axis=1)))
 
 
-def _mesh(spec: dict[str, Any], settings: Settings) -> tuple[tuple[float, ...], F64]:
-    """Return the hull of a mesh file; to a camera it is its bounding box centred on its own origin."""
-    path = resolve(spec["file"], settings.urdf.parent, settings.package_dirs)
-    client = pb.connect(pb.DIRECT)
+def _mesh(spec: dict[str, Any], settings: Settings) -> MeshFile:
+    """Return the mesh file of an obstacle, its own or one that the robot file names; SettingsError without one."""
+    table = spec
+    if "mesh" in spec:
+        table = next((t for t in settings.meshes if t["name"] == spec["mesh"]), {})
+    if "file" not in table:
+        raise SettingsError(f"obstacle {spec['name']}: mesh {spec.get('mesh')} is not in the robot file")
+    path = str(resolve(table["file"], settings.folder, settings.package_dirs))
+    scale, client = float(table.get("scale", 1.0)), pb.connect(pb.DIRECT)
     try:
         with silent():
-            shape = pb.createCollisionShape(pb.GEOM_MESH, fileName=str(path), physicsClientId=client)
+            shape = pb.createCollisionShape(pb.GEOM_MESH, fileName=path, physicsClientId=client)
             body = pb.createMultiBody(0.0, shape, physicsClientId=client)
         vertices = np.array(pb.getMeshData(body, -1, physicsClientId=client)[1], dtype=np.float64)
     except pb.error as error:
         raise SettingsError(f"obstacle {spec['name']}: {path}: {error}") from error
     finally:
         pb.disconnect(client)
-    vertices = np.unique(vertices * float(spec.get("scale", 1.0)), axis=0)
-    return tuple(np.abs(vertices).max(axis=0)), vertices
+    return MeshFile(path, scale, bool(table.get("hull", False)), 2.0 * scale * np.abs(vertices).max(axis=0))
 
 
 def position_at(obstacle: Solid, t: float) -> tuple[F64, F64]:
@@ -169,16 +200,38 @@ def shape_at(obstacle: Solid, t: float) -> Shape | None:
     position, velocity = position_at(obstacle, t)
     omega = np.array(obstacle.spec.get("omega_rad_s", (0.0, 0.0, 0.0)), dtype=np.float64)
     angle = float(np.linalg.norm(omega)) * (t - obstacle.appears)
+    o = obstacle
     wxyz = obstacle.wxyz
     if angle > 0.0:
         axis = omega / np.linalg.norm(omega)
         wxyz = multiply(np.concatenate(([math.cos(0.5 * angle)], math.sin(0.5 * angle) * axis)), wxyz)
-    return Shape(obstacle.name, obstacle.type, obstacle.dims, position, wxyz, velocity, omega)
+    return Shape(o.name, o.type, o.dims, position, wxyz, velocity, omega, o.group, o.key)
+
+
+def reported(obstacle: Solid, shape: Shape) -> Shape:
+    """Return the shape as a camera tells it: a cloud with its points, about their centre."""
+    scan = obstacle.scan
+    if scan is None:
+        return shape
+    w, v = shape.wxyz[0], shape.wxyz[1:]
+    arm = scan.centre + 2.0 * np.cross(v, np.cross(v, scan.centre) + w * scan.centre)
+    velocity = shape.velocity + np.cross(shape.omega, arm)
+    return shape._replace(position=shape.position + arm, velocity=velocity, cloud=scan.steps)
 
 
 def collision_shape(obstacle: Solid, client: int) -> int:
     """Create the obstacle's collision shape in pybullet and return its id."""
     kind, d, make = obstacle.type, obstacle.dims, pb.createCollisionShape
+    if obstacle.mesh is not None:
+        flags = 0 if obstacle.mesh.hull else pb.GEOM_FORCE_CONCAVE_TRIMESH
+        with silent():
+            scale = [obstacle.mesh.scale] * 3
+            return int(
+                make(pb.GEOM_MESH, fileName=obstacle.mesh.path, meshScale=scale, flags=flags, physicsClientId=client)
+            )
+    if obstacle.scan is not None:
+        vertices, indices = specks(obstacle.scan.points)
+        return int(make(pb.GEOM_MESH, vertices=vertices, indices=indices, physicsClientId=client))
     if len(obstacle.vertices):
         return int(make(pb.GEOM_MESH, vertices=obstacle.vertices.tolist(), physicsClientId=client))
     if kind in ("sphere", "point"):

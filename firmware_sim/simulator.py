@@ -17,7 +17,7 @@ from firmware_sim.drive import NS, Drive, State
 from firmware_sim.inject import Injector, faults_of, parse
 from firmware_sim.plant import Plant
 from firmware_sim.settings import Settings, SettingsError, load
-from firmware_sim.shapes import ObstacleEdit, shape_at
+from firmware_sim.shapes import ObstacleEdit, reported, shape_at
 from rtctl.protocol import frame
 
 F64 = NDArray[np.float64]
@@ -154,7 +154,7 @@ class Simulator:
             shape = shape_at(s, self.plant.scene_ns / NS)
             if shape is not None:
                 shown.add(s.name)
-                edits.append(ObstacleEdit(s.name, shape))
+                edits.append(ObstacleEdit(s.name, reported(s, shape)))
             elif s.name in self._shown:
                 edits.append(ObstacleEdit(s.name, None))
         self._shown = shown

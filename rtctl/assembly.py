@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from rtctl.config import Config, scales
@@ -13,7 +14,7 @@ from rtctl.control.so3 import R_of, quat_of
 from rtctl.hal.can import JointSpec, LinkSpec
 from rtctl.log.dbc import DBC, dbc_of
 from rtctl.log.dbc import Joint as DbcJoint
-from rtctl.log.header import SCENE_FILE, Header, make_header
+from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files
 from rtctl.log.mesh import MESHES, archive
 from rtctl.protocol import mit
 from rtctl.types import F64
@@ -43,7 +44,8 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
     urdf = urdf_file(config.robot.urdf, path)
     text = urdf.read_text(encoding="utf-8")
     files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
-    if meshes := archive(text, urdf.parent, package_folders(urdf)):
+    files |= meshes_to_files(robot.meshes)
+    if meshes := archive(text, urdf.parent, package_folders(urdf), _assets(config), path.resolve().parent):
         files[MESHES] = meshes
     return make_header(
         robot.name,
@@ -55,6 +57,12 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
         extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
         files=files,
     )
+
+
+def _assets(config: Config) -> tuple[str, ...]:
+    """Return the files that a config's meshes and obstacles name."""
+    named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
+    return tuple(sorted({str(name) for name in named if name}))
 
 
 def drive_dbc(config: Config) -> str:
@@ -77,4 +85,4 @@ def scene_of(config: Config, robot: Robot) -> str:
         "points": points,
         "obstacles": shapes,
     }
-    return json.dumps(scene)
+    return msgspec.json.encode(scene).decode()  # which takes the bytes of a cloud, too

@@ -16,7 +16,7 @@ import numpy as np
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
 from rtctl.config import Config
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.limits import permit, slew_reference
 from rtctl.control.pipe import warm
 from rtctl.control.robot import Robot
@@ -34,7 +34,8 @@ from rtctl.hal.transport import open_transport
 from rtctl.servo import CAN_RX, CAN_TX, Servo, blocker_name
 from rtctl.types import Command, Drive, Link, State, Verb
 
-LOCKSTEP_WAIT = 0.1  # [s] for replies before a lockstep slot goes on without them
+LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
+LOCKSTEP_SILENT = 0.05  # [s] the same once a slot went without: a drive that fell silent need not be waited for
 REVIEW = 0.5  # [s] between looks at the recorder
 
 
@@ -77,7 +78,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         stack.enter_context(InstanceLock(bus_resource(config.link.interface, config.link.channel), "link.channel"))
         robot = cfg.build(config, path)
         warm(robot)
-        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot)
+        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes)
         console = stack.enter_context(
             closing(Console(config.console.socket or default_path(robot.name), robot.dt, bounds))
         )
@@ -167,7 +168,7 @@ def _loop(
 ) -> int:
     """Turn until the supervisor says that the daemon may leave; return the exit code."""
     every = max(1, round(REVIEW / servo.robot.dt))
-    told = 0
+    told, heard = 0, True
     for slot in slots:
         request = console.poll(slot.slot)
         if signals.take():
@@ -185,7 +186,7 @@ def _loop(
         if servo.memory.done:
             return EXIT_OK
         if lockstep:
-            servo.link.wait_replies(LOCKSTEP_WAIT)
+            heard = servo.link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
     raise AssertionError("the grid has no end")
 
 
@@ -218,7 +219,7 @@ def _fallback(servo: Servo, recorder: Recorder, slots: Iterator[Slot], lockstep:
         ).tau
         _send(servo.link, recorder, Command(Drive.TORQUE, sent))
         if lockstep:
-            servo.link.wait_replies(LOCKSTEP_WAIT)
+            servo.link.wait_replies(LOCKSTEP_SILENT)
 
 
 def _stop_frames(link: CanLink, robot: Robot, recorder: Recorder) -> None:
@@ -247,6 +248,7 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
     """Return what `rtctl status` shows."""
     m, robot = servo.memory, servo.robot
     goal = m.goal
+    error, error_rot = servo.errors()
     stats = recorder.stats()
     return {
         "robot": robot.name,
@@ -254,14 +256,15 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "status": m.status.name.lower(),
         "detail": blocker_name(robot, m),
         "tick": m.tick,
-        "time_s": m.tick * robot.dt,
+        "time_s": servo.now,
         "q_rad": m.joints.q,
         "x_m": m.tip.x,
         "wxyz": quat_of(m.tip.R),
         "speed_m_s": float(np.linalg.norm(m.tip.xd)),
         "goal_m": None if goal is None else goal.position,
-        "error_m": None if goal is None else float(np.linalg.norm(goal.position - m.tip.x)),
-        "error_rad": servo.error_rot(),
+        "task": None if goal is None else task.names(goal.task),
+        "error_m": error,
+        "error_rad": error_rot,
         "clearance_m": {
             name: float(d) for name, d in zip(m.world.names, m.rho, strict=True) if name and np.isfinite(d)
         },

@@ -25,6 +25,7 @@ from rtctl.errors import ConfigError, LogError
 from rtctl.hal.can import CanLink
 from rtctl.log import schema
 from rtctl.log.fields import size_of, unit_of
+from rtctl.log.header import meshes_of
 from rtctl.log.mesh import unpacked
 from rtctl.log.replay import Logged, inputs
 from rtctl.log.run import Run
@@ -98,13 +99,17 @@ def rebuilt(run: Run) -> tuple[Config, Robot]:
         raise LogError(f"{run.path}: no config.toml or robot.urdf attached: it cannot be replayed alone")
     with tempfile.TemporaryDirectory(prefix="rtctl-replay-") as name:
         folder = Path(name)
-        (folder / "config.toml").write_text(header.config, encoding="utf-8")
-        (folder / "robot.urdf").write_text(unpacked(header.urdf, header.files, folder), encoding="utf-8")
+        urdf, text = unpacked(header.urdf, header.config, header.files, folder)
+        (folder / "config.toml").write_text(text, encoding="utf-8")
+        (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
         try:
             config = cfg.load(folder / "config.toml")
             own = msgspec.structs.replace(config.robot, urdf="robot.urdf")
             here = msgspec.structs.replace(config, robot=own)
-            return config, cfg.build(here, folder / "config.toml")
+            robot = cfg.build(here, folder / "config.toml")
+            return config, robot._replace(meshes=meshes_of(header))
+        except ValueError as error:
+            raise LogError(f"{run.path}: a mesh that is attached: {error}") from None
         except ConfigError as error:
             place = error.place.replace(f"{folder}/", f"{run.path}: ")
             raise ConfigError(place, error.got, error.wanted) from None
@@ -120,7 +125,7 @@ def other(path: Path, run: Run) -> tuple[Config, Robot]:
         raise ConfigError(f"{path}: robot.joints", ", ".join(names), f"the log's {', '.join(header.joints)}")
     if abs(1.0 / config.loop.servo_hz - header.period) > 1e-12:
         raise ConfigError(f"{path}: loop.servo_hz", config.loop.servo_hz, f"the log's {1.0 / header.period:g}")
-    return config, cfg.build(config, path)
+    return config, cfg.build(config, path)._replace(meshes=meshes_of(run.header))
 
 
 class _Null:

@@ -7,11 +7,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.memory import Memory
 from rtctl.control.pipe import initial, tick
 from rtctl.control.robot import Robot
-from rtctl.control.so3 import error_to
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import Slot
 from rtctl.log.request import encode_event, encode_request
@@ -66,6 +65,7 @@ class Servo:
         self.memory: Memory = initial(robot, first_feedback(q))
         self.digest = hashlib.sha256()
         self.missed = 0
+        self.now = 0.0  # [s] robot time of the last slot
         self.faults_seen = 0
         self.compute = 0.0  # [s] of the previous turn
         self.events: list[tuple[float, str, str]] = []  # newest last; (time [s], name, detail)
@@ -86,19 +86,20 @@ class Servo:
         self.missed += slot.missed
         self.lateness = slot.lateness
         self.faults_seen |= self.memory.in_force
-        now = slot.slot * self.robot.dt
+        self.now = now = slot.slot * self.robot.dt
         news = _news(self.robot, before, self.memory, feedback)
         self.events += [(now, name, detail) for name, detail in news]
         self._log(feedback, record, frames, request, now, news)
         self.compute = time.perf_counter() - begin
         return Turn(feedback, command, record, frames)
 
-    def error_rot(self) -> float | None:
-        """Return the angle [rad] to the goal's orientation, None when it asks for none."""
+    def errors(self) -> tuple[float | None, float | None]:
+        """Return the distance [m] and the angle [rad] to the goal, None for what it leaves free."""
         m = self.memory
-        if m.goal is None or m.goal.task == Task.POSITION:
-            return None
-        return float(np.linalg.norm(error_to(m.tip.R, m.goal.wxyz)))
+        if m.goal is None:
+            return None, None
+        error, error_rot = task.error_of(m.goal, m.tip.x, m.tip.R)
+        return error if m.goal.task & Task.POSITION else None, error_rot if task.turns(m.goal.task) else None
 
     def _log(
         self,
@@ -137,7 +138,9 @@ def _news(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> li
 
 
 def blocker_name(robot: Robot, m: Memory) -> str:
-    """Return the name of the obstacle or joint that holds the arm, '' for none."""
+    """Return the name of the obstacle, joint or lost direction that holds the arm, '' for none."""
+    if m.status == Status.SINGULAR and m.goal is not None:
+        return task.lost_words(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)
     if m.blocker < 0:
         return ""
     if m.status in (Status.LIMITED, Status.SATURATED):

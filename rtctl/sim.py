@@ -5,6 +5,7 @@ from the simulator's account of the truth, which the controller never sees.
 """
 
 import time
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,18 +14,20 @@ import numpy as np
 
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
+from rtctl.config.assets import load_assets
 from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
-from rtctl.control import faults
+from rtctl.control import faults, task
 from rtctl.control.robot import Robot
-from rtctl.control.so3 import R_of, error, quat_of
+from rtctl.control.so3 import R_of, quat_of
 from rtctl.errors import ConfigError, RtctlError
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import lockstep
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn
-from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Task, Truth, Verb
+from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
+Watch = Callable[[Servo, Truth, Turn], None]  # is shown the truth after each period, and what the servo did in it
 ARM_TIME = 2.0  # [s] within which the robot must be running
 SHOWN = frozenset(("state", "fault"))  # events that are no statuses
 
@@ -121,13 +124,10 @@ def _r(value: float) -> float | None:
 def _advanced(leg: _Leg, truth: Truth) -> _Leg:
     """Return the leg after a period: distance to the goal, to the line, and since when it has been there."""
     goal = leg.goal
-    e = float(np.linalg.norm(goal.position - truth.tip))
-    e_rot = 0.0
-    if goal.task == Task.POSE:
-        e_rot = float(np.linalg.norm(error(R_of(truth.tip_wxyz), R_of(goal.wxyz))))
-    along = goal.position - leg.start
+    e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
+    along = task.point_of(goal, leg.start) - leg.start
     length = float(np.linalg.norm(along))
-    offset = truth.tip - leg.start
+    offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
     if length > 1e-9:
         offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
     there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
@@ -160,6 +160,7 @@ class Feed:
         due = self.pending and truth.time >= self.pending[0].at_s
         if due and m.state == State.RUN and not m.outside:
             goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
+            goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
             self.waiting = (goal, truth.time, truth.tip.copy())
         return Request(verb, goal, self._seen(truth))
 
@@ -188,13 +189,17 @@ def _outside(robot: Robot, truth: Truth) -> bool:
     return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
 
 
-def open_simulator(config_path: Path, scenario: Scenario) -> Simulator:
-    """Return the installed simulator. Raises ConfigError when none is, RtctlError with what it refuses."""
+def open_simulator(config_path: Path, scenario: Scenario, path: str | Path) -> Simulator:
+    """Return the installed simulator, playing the scenario of the file `path`.
+
+    Raises ConfigError when none is installed, RtctlError with what it refuses.
+    """
     found = {e.name: e for e in entry_points(group="rtctl.simulator")}
     if "pybullet" not in found:
         raise ConfigError("entry point rtctl.simulator", sorted(found) or "none", "one named pybullet: pip install .")
     try:
-        simulator: Simulator = found["pybullet"].load()(str(config_path), scenario_dict(scenario), seed=scenario.seed)
+        play = scenario_dict(scenario, path)
+        simulator: Simulator = found["pybullet"].load()(str(config_path), play, seed=scenario.seed)
     except RtctlError:
         raise
     except Exception as error:  # another program's refusal: its words, not its traceback
@@ -202,7 +207,9 @@ def open_simulator(config_path: Path, scenario: Scenario) -> Simulator:
     return simulator
 
 
-def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = False) -> dict[str, Any]:
+def simulate(
+    path: str | Path, log: str | Path | None = None, realtime: bool = False, watch: Watch | None = None
+) -> dict[str, Any]:
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
     scenario = load_scenario(path)
     where = robot_file(scenario, path)
@@ -211,7 +218,8 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
     start = scenario.start_q_rad
     if start is not None and len(start) != robot.n:
         raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
-    simulator = open_simulator(where, scenario)
+    robot = robot._replace(meshes=load_assets((), scenario.obstacle, Path(path), robot.meshes).meshes)
+    simulator = open_simulator(where, scenario, path)
     link = CanLink(link_spec(config), InProcess.of(simulator))
     sink = None
     try:
@@ -222,7 +230,7 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
             sink = McapSink(Path(log), header_of(config, where, robot, greeting.q, counters=link.counters))
         servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
         tally = Tally(robot)
-        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime)
+        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, tally, realtime, watch)
         elapsed = time.perf_counter() - begun
     finally:
         if sink is not None:
@@ -240,7 +248,9 @@ def simulate(path: str | Path, log: str | Path | None = None, realtime: bool = F
     }
 
 
-def _play(servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool) -> int:
+def _play(
+    servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, realtime: bool, watch: Watch | None
+) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
     feed = Feed(servo.robot, scenario, simulator, tally)
     dt, begun = servo.robot.dt, time.monotonic()
@@ -250,7 +260,10 @@ def _play(servo: Servo, scenario: Scenario, simulator: Simulator, tally: Tally, 
         if truth.time >= scenario.duration_s or slot.slot * dt > scenario.duration_s + ARM_TIME:
             break
         turn = servo.turn(slot, feed.request(servo, truth))
-        tally.add(simulator.truth(), turn)
+        truth = simulator.truth()
+        tally.add(truth, turn)
+        if watch is not None:
+            watch(servo, truth, turn)
         ticks += 1
         if realtime:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))

@@ -3,7 +3,7 @@
 Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
 """
 
-from enum import IntEnum, IntFlag
+from enum import STRICT, IntEnum, IntFlag
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -92,6 +92,7 @@ class Link(IntFlag):
     SEQUENCE = 256  # a reply's counter jumped: frames were lost or overtook each other
     DISORDER = 512  # counters keep jumping
     LOG_DEGRADED = 1024  # set by the daemon: the log cannot be written
+    DERATED = 2048  # a drive says that it gives less torque than asked: hot, or at its own limit
 
 
 class Drive(IntEnum):
@@ -103,33 +104,49 @@ class Drive(IntEnum):
     CLEAR = 3  # clear a latched drive fault
 
 
-class Task(IntEnum):
-    """Which part of the pose the goal constrains."""
+class Task(IntFlag, boundary=STRICT):
+    """What of the tip's motion a goal constrains, in world axes; the rest is the posture's."""
 
-    POSITION = 0
-    POSE = 1
+    X = 1
+    Y = 2
+    Z = 4
+    RX = 8
+    RY = 16
+    RZ = 32
+    DIRECTION = 64  # where an axis of the tool points; the roll about it is free
+    POSITION = X | Y | Z
+    ORIENTATION = RX | RY | RZ
+    POSE = POSITION | ORIENTATION
+
+
+TOOL_Z = np.array([0.0, 0.0, 1.0])
+TOOL_Z.setflags(write=False)
 
 
 class Goal(NamedTuple):
     """A goal pose of the tip in the world frame."""
 
-    position: F64  # (3,) [m]
-    wxyz: F64  # (4,) unit quaternion; ignored for Task.POSITION
+    position: F64  # (3,) [m]; what the task leaves out means nothing
+    wxyz: F64  # (4,) unit quaternion; for Task.DIRECTION any that turns `axis` there
     task: Task
     tolerance: float  # [m] arrived within this and within tolerance_rot
     tolerance_rot: float  # [rad]
+    axis: F64 = TOOL_Z  # (3,) unit vector in the tip's frame, for Task.DIRECTION
 
 
 class Shape(NamedTuple):
-    """An obstacle as it is described: a named, posed, possibly moving primitive."""
+    """An obstacle as it is described: a named, posed, possibly moving primitive, mesh or cloud of points."""
 
     name: str
-    type: str  # sphere | capsule | segment | point | box | plane | ellipsoid | n_ellipsoid | ...
+    type: str  # sphere | capsule | segment | point | box | plane | ellipsoid | n_ellipsoid | mesh | cloud | ...
     dims: F64  # (4,) meaning by type, see control.primitives
     position: F64  # (3,) [m] of the primitive's frame in the world
     wxyz: F64  # (4,) orientation
     velocity: F64  # (3,) [m/s]
     omega: F64  # (3,) [rad/s]
+    group: str = ""  # parts of one union: of them the nearest to a point acts on it; "" = adds to the others
+    mesh: str = ""  # of a mesh: the name of its solid among the robot's
+    cloud: bytes = b""  # of a cloud: x, y, z of each point in whole steps, little-endian int16
 
 
 class ObstacleEdit(NamedTuple):
@@ -138,6 +155,7 @@ class ObstacleEdit(NamedTuple):
     name: str
     shape: Shape | None
     age: float = 0.0
+    feed: bool = False  # somebody keeps observing it: the observation grows stale even of what rests
 
 
 class Request(NamedTuple):

@@ -19,12 +19,13 @@ import pytest
 
 from rtctl.cli import build_parser, main, values
 from rtctl.control.record import record_dtype
+from rtctl.control.task import names
 from rtctl.errors import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, EXIT_USAGE, UsageError
 from rtctl.hal import doctor
 from rtctl.hal.console import Console
 from rtctl.hal.messages import Bounds
 from rtctl.log import Kind, McapSink, make_header
-from rtctl.types import ObstacleEdit, Request, Verb
+from rtctl.types import ObstacleEdit, Request, Task, Verb
 
 ROOT = Path(__file__).parent.parent
 Said = pytest.CaptureFixture[str]
@@ -252,6 +253,43 @@ def test_hold_orientation_asks_for_the_present_one(arm: Arm) -> None:
     assert goal.wxyz.tolist() == [0.0, 1.0, 0.0, 0.0]
 
 
+@pytest.mark.parametrize(
+    ("words", "task"),
+    [
+        ([], Task.POSITION),
+        (["--axes", "xz"], Task.X | Task.Z),
+        (["--rpy", "0", "0", "1"], Task.POSE),
+        (["--direction", "0", "0", "-1", "--tool-axis", "y"], Task.POSITION | Task.DIRECTION),
+        (["--axes", "y", "--direction", "0", "1", "0"], Task.Y | Task.DIRECTION),
+        (["--axes", "none", "--direction", "0", "1", "0"], Task.DIRECTION),
+    ],
+    ids=lambda value: "" if isinstance(value, list) else names(value),
+)
+def test_a_goal_constrains_what_was_typed(arm: Arm, words: list[str], task: Task) -> None:
+    assert main(["goal", "0.1", "0.2", "0.3", *words, "--wait"]) == EXIT_OK
+    goal = arm.requests[0].goal
+    assert goal is not None
+    assert goal.task == task
+    assert goal.axis.tolist() == ([0.0, 1.0, 0.0] if "--tool-axis" in words else [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--axes", "xw"], "axes"),
+        (["--axes", "xx"], "goal.axes: got x, x, wanted each axis once"),
+        (["--tool-axis", "x"], "goal.tool_axis: got x, wanted a direction beside it"),
+        (["--direction", "0", "0", "0"], "goal.direction"),
+        (["--axes", "none"], "wanted a position, an orientation or a direction"),
+    ],
+    ids=["unknown axis", "axis twice", "axis without direction", "no direction", "nothing"],
+)
+def test_a_part_of_a_pose_that_makes_no_sense_is_refused(arm: Arm, words: list[str], why: str, capsys: Said) -> None:
+    assert main(["goal", "0.1", "0.2", "0.3", *words]) == EXIT_FAILED
+    assert why in capsys.readouterr().err
+    assert arm.requests == []
+
+
 def test_a_goal_out_of_reach_is_refused_in_one_line(arm: Arm, capsys: Said) -> None:
     assert main(["goal", "3", "0", "0.5"]) == EXIT_FAILED
     assert "3.041 m from the base" in capsys.readouterr().err
@@ -392,6 +430,9 @@ def test_watching_a_daemon_that_ends_says_so(arm: Arm) -> None:
         ("1,2,3,1,0,0,0", {"position_m": [1, 2, 3], "wxyz": [1, 0, 0, 0]}),
         ("z,y,x,tolerance_m\n3,2,1,0.01", {"position_m": [1, 2, 3], "tolerance_m": 0.01}),
         ("x,y,z,roll,pitch,yaw\n1,2,3,,,", {"position_m": [1, 2, 3]}),
+        ("x,y,z,axes\n1,2,3,xy", {"position_m": [1, 2, 3], "axes": ["x", "y"]}),
+        ("dx,dy,dz,tool_axis\n0,0,-1,-x", {"direction": [0, 0, -1], "tool_axis": "-x"}),
+        ('{"rpy_rad": [1,2,3]}', {"rpy_rad": [1, 2, 3]}),
         ('{"position_m": [1,2,3], "hold": "orientation"}', {"position_m": [1, 2, 3], "hold": "orientation"}),
     ],
 )

@@ -300,7 +300,7 @@ MALFORMED = {
     "a text for a number": b'{"verb":"goal","position_m":["0.5",0,0.4]}',
     "a truth for a number": b'{"verb":"goal","position_m":[true,0,0.4]}',
     "two coordinates": b'{"verb":"goal","position_m":[0.5,0.4]}',
-    "a null": b'{"verb":"goal","position_m":null}',
+    "a null": b'{"verb":"goal","position_m":[null,0,0.4]}',
     "nested lists": b"[" * 60_000,
     "nested objects": b'{"verb":' * 8_000,
     "nested below a key": b'{"verb":"goal","position_m":' + b"[" * 60_000,

@@ -32,7 +32,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
     table = obstacles_empty(arm.slots)
     for k, shape in enumerate(shapes):
         table = with_shape(table, k, shape)
-    space = osc.operational_space(model.J, model.A_inv, model.Lambda_inv, 6, arm.motion)
+    space = osc.operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), arm.motion)
     return law.evaluate_law(arm, model, space, table, q, np.zeros(7), ZERO, ZERO, e, ZERO, e, ZERO, q, 1.0)
 
 
@@ -53,7 +53,7 @@ def finite_and_moderate_at_a_singular_pose() -> bool:
     return bool(np.isfinite(wanted).all() and np.abs(wanted).max() < 300.0)
 
 
-def bare_inverse(J: F64, A_inv: F64, Lambda_inv: F64, rows: int, p: osc.MotionParams) -> OperationalSpace:
+def bare_inverse(J: F64, A_inv: F64, Lambda_inv: F64, S: F64, p: osc.MotionParams) -> OperationalSpace:
     try:
         Lambda = np.linalg.inv(Lambda_inv)
     except np.linalg.LinAlgError:
@@ -311,7 +311,7 @@ def starts_where_it_is() -> bool:
 
 def test_switching_on_again_begins_from_where_the_arm_is(monkeypatch: Patch):
     assert starts_where_it_is()
-    monkeypatch.setattr(session, "held_here", lambda m: m)
+    monkeypatch.setattr(session, "held_here", lambda robot, m: m)
     assert not starts_where_it_is()
 
 
@@ -334,7 +334,7 @@ def test_the_speed_limit_holds(monkeypatch: Patch):
         return k * e, k * e_rot
 
     monkeypatch.setattr(law, "velocity_reference", unlimited)
-    monkeypatch.setattr(law, "tip_guard", lambda *a: (np.zeros(7), False))
+    monkeypatch.setattr(law, "tip_row", lambda *a: (np.zeros(7), np.inf))
     assert not within_the_speed_limit()
 
 

@@ -48,7 +48,14 @@ def fd_frame(can_id: int, data: bytes, flags: int) -> bytes:
     return struct.pack("=IBBxx64s", can_id, len(data), flags, data)
 
 
-GOAL = Goal(np.array([0.1, 1 / 3, -2e-17]), np.array([1.0, 0, 0, 0]), Task.POSE, 0.005, 0.02)
+GOAL = Goal(
+    np.array([0.1, 1 / 3, -2e-17]),
+    np.array([1.0, 0, 0, 0]),
+    Task.X | Task.DIRECTION,
+    0.005,
+    0.02,
+    np.array([0.6, 0, 0.8]),
+)
 BALL = Shape(
     "ball", "sphere", np.array([0.1, 0, 0, 0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3) / 7, np.zeros(3)
 )

@@ -7,6 +7,7 @@ import json
 import re
 import runpy
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from rosbags.typesys import Stores, get_typestore
 from rtctl import config as cfg
 from rtctl.cli import main
 from rtctl.control.record import record_dtype
-from rtctl.log import Kind, McapSink, make_header, read
+from rtctl.errors import LogError
+from rtctl.log import Kind, McapSink, make_header, mesh, read
 from rtctl.log.fields import FIELDS
 from rtctl.log.info import info
 from rtctl.log.run import read_run
@@ -33,7 +35,7 @@ from rtctl.replay import rebuilt, replay
 from rtctl.sim import simulate
 from tests.arms import panda
 from tests.lab import PANDA, ROOT, robot
-from tools import golden
+from tools import crash, golden
 
 SCENE = f"""
 robot = "{PANDA}"
@@ -165,6 +167,47 @@ def test_diff_of_a_run_with_itself_and_with_another(log: Path, tmp_path: Path):
     assert code == 1
     assert "feedback_stale" in out
     assert (tmp_path / "d.png").stat().st_size > 10_000
+
+
+def test_segments_that_the_recorder_wrote_replay_as_one_run_and_a_missing_one_is_named(tmp_path: Path):
+    rig = crash.Rig(tmp_path / "log", folders=[tmp_path], segment_s=0.5)
+    for k in range(1500):
+        rig.turn()
+        if k % 20 == 0:
+            time.sleep(0.02)  # the recorder changes files by the clock
+    rig.close()
+    first, *more = sorted((tmp_path / "log").glob("*.mcap"))
+    assert more
+    done = replay(read_run(more[-1]))  # whichever of them is named
+    assert done.identical
+    assert (done.ticks, done.frames) == (1500, 7 * 1500)
+    assert read_run(first)["/tick"].tick.tolist() == list(range(1500))
+    if len(more) > 1:
+        more[0].unlink()
+        code, _, err = call("replay", str(first))
+        assert (code, "001 are missing" in err) == (1, True)
+    first.unlink()
+    code, _, err = call("replay", str(more[-1]))
+    assert code == 1
+    assert err.count("\n") == 1
+
+
+def test_meshes_of_urdf_and_config_travel_with_the_log(tmp_path: Path):
+    for name in ("arm.stl", "rock.obj"):
+        (tmp_path / name).write_bytes(name.encode() * 100)
+    urdf = '<robot><link name="a"><collision><geometry><mesh filename="arm.stl"/></geometry></collision></link></robot>'
+    config = '[[mesh]]\nname = "rock"\nfile = "rock.obj"\n'
+    packed = mesh.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)
+    assert packed == mesh.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)  # equal logs, equal bytes
+    there = tmp_path / "there"
+    there.mkdir()
+    new_urdf, new_config = mesh.unpacked(urdf, config, {mesh.MESHES: packed}, there)
+    for text, name in ((new_urdf, "arm.stl"), (new_config, "rock.obj")):
+        (place,) = re.findall(r'"([^"]+there[^"]+)"', text)
+        assert Path(place).read_bytes() == (tmp_path / name).read_bytes()
+    with pytest.raises(LogError, match=r"meshes\.zip"):
+        mesh.unpacked(urdf, config, {mesh.MESHES: packed[:-30]}, there)
+    assert mesh.archive(urdf.replace("arm", "none"), tmp_path, ()) == b""  # what is not there cannot be attached
 
 
 # ---- arrays

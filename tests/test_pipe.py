@@ -12,7 +12,22 @@ import numpy as np
 import pytest
 
 from rtctl import config as cfg
-from rtctl.control import arm_field, estimator, faults, field, firas, law, limits, linalg, osc, scan, so3, world
+from rtctl.control import (
+    arm_field,
+    bvh,
+    estimator,
+    faults,
+    field,
+    firas,
+    law,
+    limits,
+    linalg,
+    osc,
+    primitives,
+    scan,
+    so3,
+    world,
+)
 from rtctl.control.memory import Memory
 from rtctl.control.pipe import initial, tick, warm
 from rtctl.hal.clock import lockstep
@@ -20,8 +35,9 @@ from rtctl.log import read, segments
 from rtctl.log.replay import inputs
 from rtctl.servo import first_feedback
 from rtctl.sim import simulate
-from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Record, Request, State, Verb
+from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Record, Request, State, Task, Verb
 from tests.arms import PANDA_HOME
+from tests.bodies import cloud_shape
 from tests.lab import DOWN, PANDA, Lab, Standing, at_rest, goal, healthy, lab, leaves, robot, same, seen, sphere
 
 BALL = sphere("ball", [0.5, 0.15, 0.5], 0.06, (0.0, -0.05, 0.0))
@@ -105,7 +121,22 @@ def test_the_tick_reads_no_clock_no_file_and_no_chance(monkeypatch: pytest.Monke
 def test_warming_compiles_all_that_a_run_needs():
     kernels = {
         f"{module.__name__}.{name}": thing
-        for module in (arm_field, estimator, faults, field, firas, law, limits, linalg, osc, scan, so3, world)
+        for module in (
+            arm_field,
+            bvh,
+            estimator,
+            faults,
+            field,
+            firas,
+            law,
+            limits,
+            linalg,
+            osc,
+            primitives,
+            scan,
+            so3,
+            world,
+        )
         for name, thing in vars(module).items()
         if hasattr(thing, "signatures")
     }
@@ -114,6 +145,11 @@ def test_warming_compiles_all_that_a_run_needs():
     before = {name: len(kernel.signatures) for name, kernel in kernels.items()}
     with lab() as here:
         eventful(here)
+        dust = np.random.default_rng(0).integers(-999, 999, (1000, 3))
+        cloud = cloud_shape(dust, 1e-4, 0.01, np.array([0.6, 0.3, 0.5]))
+        for feed in (True, False):
+            here.step(Request(obstacles=(ObstacleEdit("dust", cloud, 0.01, feed), ObstacleEdit("again", cloud))))
+            here.run(0.01)
     assert {name: len(kernel.signatures) for name, kernel in kernels.items()} == before
 
 
@@ -131,6 +167,8 @@ def eventful(here: Lab) -> Lab:
     here.step(missed=2)
     here.ask([0.45, 0.0, 0.6])
     here.run(0.2)
+    here.step(Request(goal=goal(here.memory, [0.45, 0.0, 0.6])._replace(task=Task.X | Task.DIRECTION, axis=DOWN[:3])))
+    here.run(0.1)
     for _ in range(3):
         here.step(missed=1)
     here.run(0.3)

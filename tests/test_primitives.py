@@ -288,7 +288,7 @@ def test_nearly_a_box_is_measured_like_the_box() -> None:
     assert np.max(rounded_box - box) < 0.02
 
 
-@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("kind", [t for t in TYPES if t not in ("mesh", "cloud")])  # those are in test_bodies
 def test_a_coordinate_that_is_not_a_number_never_becomes_a_distance(kind: str) -> None:
     body = shape(kind, 0.1, 0.2, 0.3, 2.0)
     rho, _ = distance(body, np.array([[np.nan, 0.1, 0.1], [0.1, np.nan, 0.1], [0.1, 0.1, np.nan], [0.1, 0.1, 0.1]]))

@@ -272,7 +272,7 @@ def models(robot: Robot, count: int) -> Iterator[Row]:
         timed(lambda: robot.body.evaluate(q, qd, robot.points, robot.own), count),
     )
     m = robot.body.evaluate(q, qd, robot.points, robot.own)
-    call = lambda: operational_space(m.J, m.A_inv, m.Lambda_inv, 6, robot.motion)  # noqa: E731
+    call = lambda: operational_space(m.J, m.A_inv, m.Lambda_inv, np.eye(6), robot.motion)  # noqa: E731
     yield row("model", "operational space", timed(call, count))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtctl import config as cfg
 from rtctl.assembly import link_spec
-from rtctl.control import law, osc
+from rtctl.control import guards, osc
 from rtctl.control.firas import field_buffers
 from rtctl.control.memory import Memory
 from rtctl.control.model import Model
@@ -194,7 +194,7 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         ball = shape(f"ball{k}", "sphere", (0.05,), model.P[j] + away, 0.1 * rng.normal(size=3))
         obstacles = with_shape(obstacles, k, ball)
     small = robot._replace(points=points, slots=slots, scratch=field_buffers(slots, m, robot.n))
-    space = operational_space(model.J, model.A_inv, model.Lambda_inv, 6, robot.motion)
+    space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), robot.motion)
     twist = model.J @ qd
     e, e_rot = np.array([0.1, 0.2, -0.05]), np.array([0.1, 0.0, 0.2])
     v_ref, w_ref = np.array([0.05, 0.05, 0.0]), np.array([0.1, 0.0, 0.1])
@@ -257,14 +257,15 @@ class BoundFloor:
             for each in (
                 q, qd, model.q, model.A, model.A_inv, model.h, model.g, model.J, model.Jdqd, space.Lambda, space.Jbar,
                 space.NT, model.P, model.Jp, model.B, r.points.radius, xd, omega, e, e_rot, v_ref, w_ref, q_rest,
-                r.q_min, r.q_max, r.qd_max, r.tau_max, r.braking, p.qdd_posture, b.rho0, b.rho_min, b.rho_num, b.eta,
-                b.k_d, obstacles.p, obstacles.v, obstacles.dims[:, 0],
+                r.q_min, r.q_max, r.qd_max, r.tau_max, r.tau_rate, r.braking, p.qdd_posture, b.rho0, b.rho_min,
+                b.rho_num, b.eta, b.k_d, obstacles.p, obstacles.v, obstacles.dims[:, 0],
             )
         ]  # fmt: skip
         self._scalars = np.array([
             p.k_p, p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max, p.speed_margin, p.k_q, p.d_q, a.rho0, a.rho_min,
-            a.rho_num, a.eta, a.k_d, a.look_ahead, a.v_smooth, a.m_max, r.dt, law.SPEED_BAND, law.SPEED_HORIZON,
-            law.LEAST_SHARE, p.epsilon, osc.SPEED_FLOOR,
+            a.rho_num, a.eta, a.k_d, a.look_ahead, a.v_smooth, a.m_max, r.dt, guards.SPEED_BAND,
+            guards.SPEED_HORIZON, guards.LEAST_SHARE, osc.SPEED_FLOOR, guards.JERK_SHARE, guards.TIP_SLOW, guards.NEAR,
+            guards.ABREAST, guards.ENOUGH, guards.STEPS, guards.PAIRS, guards.SOFT,
         ])  # fmt: skip
         self._link = r.points.link
         self._pointers = (ctypes.c_void_p * len(self._arrays))(*(each.ctypes.data for each in self._arrays))

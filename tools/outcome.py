@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rtctl.types import F64, Task
+from rtctl.control.task import turns
+from rtctl.types import F64
 from tools.trace import Trace
 
 REACHED, REACHED_ROT = 5e-3, 0.02  # [m], [rad] within which a goal counts as reached
@@ -125,9 +126,8 @@ def _goal(trace: Trace, given: Given, end: int) -> GoalOutcome:
     """
     start, stop = trace.at(given.slot), max(trace.at(end), trace.at(given.slot) + 1)
     part, goal = slice(start, stop), trace.goals[given.slot]
-    e = trace.error(part, goal.position)
-    pose = goal.task == Task.POSE
-    e_rot = trace.error_rot(part, goal.wxyz) if pose else np.zeros(len(e))
+    e, e_rot = trace.errors(part, goal)
+    pose = turns(goal.task)
     there = (e <= REACHED) & (e_rot <= REACHED_ROT)
     elapsed = trace.time[part] - trace.time[start]
     outside = np.flatnonzero(~there)

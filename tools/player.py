@@ -11,6 +11,7 @@ from rtctl.hal.client import Session, accepted
 from tools.outcome import Given
 from tools.pair import POLL, DemoError
 
+GOAL_KEYS = ("position_m", "axes", "wxyz", "rpy_rad", "hold", "direction", "tool_axis", "tolerance_m", "tolerance_rad")
 STUCK_S = 60.0  # [s] of wall time in which the controller's must go on
 RESET_S = 0.5  # [s] from a reset to the next attempt to arm
 PROGRESS = 1.0  # [s] of the scenario between two lines
@@ -131,8 +132,9 @@ class _Player:
 
     def put(self, number: int, goal: TimedGoal) -> None:
         """Put a goal to the controller."""
-        message: dict[str, Any] = {"verb": "goal", "position_m": list(goal.position_m)}
-        for key in ("wxyz", "rpy_rad", "hold", "tolerance_m", "tolerance_rad"):
+        message: dict[str, Any] = {"verb": "goal"}
+        place = goal.position_m or (0.0, 0.0, 0.0)
+        for key in GOAL_KEYS:
             value = getattr(goal, key)
             if value is not None:
                 message[key] = list(value) if isinstance(value, tuple) else value
@@ -140,8 +142,8 @@ class _Player:
         reply = self.session.ask(message)
         refusal = "" if reply.get("ok") else str(reply.get("error", "without a reason"))
         slot = int(reply.get("slot", self.slot(status)))
-        self.given.append(Given(number, goal.position_m, slot, refusal))
-        where = ", ".join(f"{c:.3g}" for c in goal.position_m)
+        self.given.append(Given(number, place, slot, refusal))
+        where = ", ".join(f"{c:.3g}" for c in place)
         text = f"goal {number} of {len(self.scenario.goal)}: ({where}) m{_manner(goal)}"
         text += f" refused: {refusal}" if refusal else ""
         self.line((slot - self.began) * self.period, "fault" if refusal else "goal", text)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from rtctl.control.so3 import R_of
+from rtctl.experiment.outline import axis_view, outline
 from rtctl.types import F64, Shape
 from tools.outcome import REACHED, GoalOutcome, Outcome
 from tools.trace import Trace, Track
@@ -31,7 +32,6 @@ NEARBY = 1.0  # [m] an obstacle further from the origin need not be on the maps
 POINTS = 4000  # of a curve: more than a page shows
 GHOSTS = 11  # of a moving obstacle
 TRAIL = 0.15  # [m] beyond the window to which its trail goes
-AROUND = np.linspace(0.0, 2.0 * np.pi, 145)
 Axes = Any
 Window = tuple[F64, F64]  # corners (3,) [m]
 
@@ -222,45 +222,8 @@ def _ghosts(track: Track, window: Window) -> list[Shape]:
 
 
 def silhouette(shape: Shape, plane: tuple[int, int]) -> F64:
-    """Return the outline (k, 2) [m] of a convex solid seen along the third axis.
-
-    The point of the solid that reaches furthest in each direction of the view, h(u) = argmax x.u.
-    """
-    R = R_of(shape.wxyz)
-    u = np.zeros((len(AROUND), 3))
-    u[:, plane[0]], u[:, plane[1]] = np.cos(AROUND), np.sin(AROUND)
-    points: F64 = shape.position + _furthest(shape, u @ R) @ R.T
-    return points[:, plane]
-
-
-def _furthest(shape: Shape, u: F64) -> F64:
-    """Return the points (k, 3) of a solid in its own frame that reach furthest in the directions u (k, 3)."""
-    d = shape.dims
-    flat = np.hypot(u[:, 0], u[:, 1])[:, None].clip(min=1e-12)
-    side = np.sign(u[:, 2:])
-    x: F64
-    match shape.type:
-        case "box":
-            x = np.sign(u) * d[:3]
-        case "capsule" | "segment":
-            x = u * d[0] + side * np.array([0.0, 0.0, d[1]])
-        case "cylinder":
-            x = np.hstack([d[0] * u[:, :2] / flat, side * d[1]])
-        case "cone":
-            top = d[1] * flat + d[2] * u[:, 2:] > d[0] * flat - d[2] * u[:, 2:]
-            x = np.hstack([np.where(top, d[1], d[0]) * u[:, :2] / flat, np.where(top, d[2], -d[2])])
-        case "ellipsoid" | "n_ellipsoid":
-            n = d[3] if shape.type == "n_ellipsoid" else 1.0
-            p = 2.0 * n / (2.0 * n - 1.0)  # the dual norm's exponent: x_i ~ |a_i u_i|^(p - 1)
-            w = np.abs(u * d[:3])
-            size = (w**p).sum(1, keepdims=True) ** (1.0 / p)
-            x = np.sign(u) * d[:3] * (w / size) ** (p - 1.0)
-        case "n_cylinder":  # drawn with its edges
-            w = u[:, :2] * d[:2]
-            x = np.hstack([d[:2] * w / np.linalg.norm(w, axis=1, keepdims=True).clip(min=1e-12), side * d[2]])
-        case _:  # sphere, point
-            x = u * d[0]
-    return x
+    """Return the outline (k, 2) [m] of a convex solid seen along the third axis."""
+    return outline(shape, axis_view(*plane))
 
 
 # ---- panels over time
@@ -273,7 +236,7 @@ def _error(axes: Axes, trace: Trace, outcome: Outcome, colours: dict[str, str]) 
     for g, end in zip(taken, ends, strict=True):
         start = trace.at(g.given.slot)
         part = slice(start, max(start + 1, min(end, int(np.flatnonzero(trace.running)[-1]) + 1)))
-        e = trace.error(part, trace.goals[g.given.slot].position)
+        e, _ = trace.errors(part, trace.goals[g.given.slot])
         axes.plot(*_curve(trace.time[part], np.maximum(e * 1e3, 1e-3), np.max), color=BLUE, lw=1.6)
     axes.set_yscale("log")
     axes.set_ylim(0.02, 2000.0)

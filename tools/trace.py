@@ -9,9 +9,12 @@ import numpy as np
 from rtctl.config import Config
 from rtctl.config.obstacles import shape_of
 from rtctl.control import faults, world
-from rtctl.control.so3 import R_of, error
+from rtctl.control.meshes import Meshes
+from rtctl.control.so3 import R_of
+from rtctl.control.task import error_of
 from rtctl.errors import LogError
 from rtctl.log import read, segments
+from rtctl.log.header import meshes_of
 from rtctl.log.replay import requests_of
 from rtctl.types import B1, F64, I64, Drive, Goal, Request, Shape, State
 
@@ -77,15 +80,10 @@ class Trace(NamedTuple):
         """Return the first tick at or after a slot of the grid."""
         return int(np.searchsorted(self.slot, slot))
 
-    def error(self, part: slice, goal: F64) -> F64:
-        """Return the distance [m] of the tip to a goal (3,) in a stretch of ticks."""
-        distance: F64 = np.sqrt(((self.x[part] - goal) ** 2).sum(1))
-        return distance
-
-    def error_rot(self, part: slice, wxyz: F64) -> F64:
-        """Return the angle [rad] to a goal's orientation (4,) in a stretch of ticks."""
-        R = R_of(wxyz)
-        return np.array([float(np.linalg.norm(error(R_of(w), R))) for w in self.wxyz[part]])
+    def errors(self, part: slice, goal: Goal) -> tuple[F64, F64]:
+        """Return distance [m] and angle [rad] of the tip to a goal in a stretch of ticks, 0 where the goal is free."""
+        both = np.array([error_of(goal, x, R_of(w)) for x, w in zip(self.x[part], self.wxyz[part], strict=True)])
+        return both[:, 0], both[:, 1]
 
 
 def trace(path: Path | str, config: Config, began: int) -> Trace:
@@ -120,7 +118,7 @@ def trace(path: Path | str, config: Config, began: int) -> Trace:
         faults=faults.names(int(np.bitwise_or.reduce(c["faults"].astype(np.int64)))),
         period=header.period,
         joints=header.joints,
-        tracks=_tracks(time, c["rho"], _spans(config, requests, c["tick"].astype(np.int64))),
+        tracks=_tracks(time, c["rho"], _spans(config, meshes_of(header), requests, c["tick"].astype(np.int64))),
         v_max=config.motion.v_max_m_s,
         influence=config.avoid.influence_m,
         clearance=config.avoid.clearance_m,
@@ -130,10 +128,12 @@ def trace(path: Path | str, config: Config, began: int) -> Trace:
 Span = tuple[int, int, tuple[str, ...], list[Shape]]
 
 
-def _spans(config: Config, requests: Iterable[tuple[int, Request]], ticks: I64) -> Iterator[Span]:
+def _spans(config: Config, known: Meshes, requests: Iterable[tuple[int, Request]], ticks: I64) -> Iterator[Span]:
     """Yield stretches of ticks [start, stop) between two edits, the names of the slots, and the shapes just set."""
     edits = [shape_of(o) for o in config.obstacle]
-    table = world.with_static(world.empty(), tuple(edits))
+    # the points of a config's own cloud are not in the log; here its name and place are enough
+    edits = [s._replace(type="point") if s.type == "cloud" else s for s in edits]
+    table = world.with_static(world.empty(known=known), tuple(edits))
     start, count = 0, len(ticks)
     for tick, request in requests:
         if request.obstacles:

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import logs, offline, operate
+from rtctl.cli import experiments, logs, offline, operate
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -28,6 +28,7 @@ def build_parser() -> Parser:
     offline.add_before(commands)
     operate.add(commands)
     offline.add_after(commands)
+    experiments.add(commands)
     logs.add(commands)
     return parser
 

@@ -19,7 +19,7 @@ MOVING_STATES = ("ARMED", "RUN")
 class Outcome(NamedTuple):
     """What became of a goal."""
 
-    position: list[float]  # (3,) [m]
+    position: list[float] | None  # (3,) [m], None for an orientation alone
     arrived: bool
     why: str  # the status, state or refusal that ended it
     time: float  # [s]
@@ -31,14 +31,19 @@ class Outcome(NamedTuple):
         if as_json:
             print(json.dumps(self.as_dict()), flush=True)
             return
-        where = " ".join(f"{c:+.3f}" for c in self.position)
+        where = " ".join(f"{c:+.3f}" for c in self.position) + " m" if self.position else "orientation"
         word = "arrived" if self.arrived else f"NOT REACHED: {self.why}"
-        print(f"goal {where} m  {word}  {self.time:.2f} s  {_figure(self.error, 1e3, 'mm')}", flush=True)
+        print(f"goal {where}  {word}  {self.time:.2f} s  {self._missed()}", flush=True)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome for --json; what is unknown is null."""
         known = {key: None if math.isnan(value) else value for key, value in self._errors().items()}
         return {"position_m": self.position, "arrived": self.arrived, "why": self.why, "time_s": self.time, **known}
+
+    def _missed(self) -> str:
+        if math.isnan(self.error):
+            return _figure(self.error_rot, 1.0, "rad", 4)
+        return _figure(self.error, 1e3, "mm", 2)
 
     def _errors(self) -> dict[str, float]:
         return {"error_m": self.error, "error_rad": self.error_rot}
@@ -52,7 +57,7 @@ def send(session: Session, message: dict[str, Any]) -> dict[str, Any]:
 def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> Outcome:
     """Return what became of a goal within `timeout` [s]. Raises RequestError when it is refused at once."""
     send(session, message)
-    wanted, begin = message["position_m"], time.monotonic()
+    wanted, begin = message.get("position_m"), time.monotonic()
     while True:
         status = accepted(session.ask({"verb": "status"}))  # made after the goal was taken: never of the one before
         why = _end(status, wanted)
@@ -61,7 +66,7 @@ def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> 
             why = f"{status.get('status', '?')} {status.get('detail') or ''} after {timeout:g} s".replace("  ", " ")
         if why:
             errors = [_known(status.get(key)) for key in ("error_m", "error_rad")]
-            return Outcome(list(wanted), why == ARRIVED, why, elapsed, *errors)
+            return Outcome(wanted, why == ARRIVED, why, elapsed, *errors)
         time.sleep(POLL)
 
 
@@ -78,7 +83,7 @@ def run_stream(session: Session, lines: Iterable[str], source: str, arguments: a
         except RequestError as error:
             if not arguments.keep_going:
                 raise RequestError(f"{source}:{at}: {error}") from None
-            outcome = Outcome(message["position_m"], False, str(error), 0.0, math.nan, math.nan)
+            outcome = Outcome(message.get("position_m"), False, str(error), 0.0, math.nan, math.nan)
         outcome.show(arguments.json)
         failed += not outcome.arrived
         if failed and not arguments.keep_going:
@@ -86,14 +91,14 @@ def run_stream(session: Session, lines: Iterable[str], source: str, arguments: a
     return EXIT_FAILED if failed else EXIT_OK
 
 
-def _end(status: dict[str, Any], wanted: list[float]) -> str:
+def _end(status: dict[str, Any], wanted: list[float] | None) -> str:
     """Return why the goal is over, or nothing while it is pursued."""
     state = str(status.get("state"))
     if state not in MOVING_STATES:
         faults = ", ".join(map(str, status.get("faults") or ()))
         return f"{state}{': ' + faults if faults else ''}"
     present = status.get("goal_m")
-    if present is None or any(abs(a - b) > 1e-6 for a, b in zip(present, wanted, strict=True)):
+    if present is None or any(abs(a - b) > 1e-6 for a, b in zip(present, wanted or present, strict=True)):
         return "replaced by another goal"
     return ARRIVED if status.get("status") == ARRIVED else ""
 
@@ -102,5 +107,5 @@ def _known(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def _figure(value: float, scale: float, unit: str) -> str:
-    return "" if math.isnan(value) else f"error {value * scale:.2f} {unit}"
+def _figure(value: float, scale: float, unit: str, digits: int) -> str:
+    return "" if math.isnan(value) else f"error {value * scale:.{digits}f} {unit}"

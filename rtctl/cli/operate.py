@@ -16,6 +16,21 @@ VERBS = {
     "reset": "leave a latched stop or fault, once its cause is gone",
     "recover": "allow a slow move inward from beyond a joint limit",
 }
+KEYS_OF = {
+    "sphere": "radius_m",
+    "point": "",
+    "capsule": "radius_m length_m",
+    "segment": "length_m [radius_m]",
+    "cylinder": "radius_m length_m",
+    "cone": "radius_m height_m [top_radius_m]",
+    "box": "size_m=x,y,z",
+    "plane": "[normal=x,y,z]",
+    "ellipsoid": "semi_axes_m=a,b,c",
+    "n_ellipsoid": "semi_axes_m=a,b,c n",
+    "n_cylinder": "semi_axes_m=a,b,c n",
+    "mesh": "mesh=NAME",
+    "cloud": "file=FILE.npy|.xyz|.ply point_radius_m [voxel_m]",
+}
 WATCH_PERIOD = 0.1  # [s]
 EVERYTHING = "*"
 
@@ -25,20 +40,24 @@ def add(commands: Commands) -> None:
     for verb, text in VERBS.items():
         add_daemon(command(commands, verb, text, f"rtctl {verb} --robot panda", _verb))
     example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
-    goal = command(commands, "goal", "send the tip to a position [m], or a pose", example, _goal)
+    goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
         goal.add_argument(axis, metavar=axis.upper(), type=number, help="in the world frame [m]")
     turn = goal.add_mutually_exclusive_group()
     turn.add_argument("--rpy", metavar=("R", "P", "Y"), nargs=3, type=number, help="roll, pitch, yaw [rad]")
     turn.add_argument("--wxyz", metavar=("W", "X", "Y", "Z"), nargs=4, type=number, help="unit quaternion")
     turn.add_argument("--hold-orientation", action="store_true", help="keep the present orientation")
+    turn.add_argument("--direction", metavar=("X", "Y", "Z"), nargs=3, type=number, help="where the tool's axis points")
+    goal.add_argument("--tool-axis", metavar="AXIS", help="that axis of the tip: x y z -x -y -z (z)")
+    goal.add_argument("--axes", metavar="AXES", help="of X Y Z those that count: xy, z, …; none: orientation alone")
     goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
     _add_waiting(goal)
     goal.add_argument("--wait", action="store_true", help="return when the tip has arrived; exit code 1 if it does not")
     goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
-        'x,y,z,w,x,y,z; under a header of such names; or JSON: {"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
+        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, tool_axis, axes, tolerance_m); or JSON:\n"
+        '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
     )
     goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
     _add_waiting(goals)
@@ -69,8 +88,15 @@ def _add_obstacle(commands: Commands) -> None:
     example = "rtctl obstacle set crate box size_m=0.2,0.2,0.1 position_m=0.5,0,0.05"
     setter = command(actions, "set", "put an obstacle, or move it", example, _set)
     setter.add_argument("name", metavar="NAME")
-    setter.add_argument("type", metavar="TYPE", help="sphere, box, capsule, plane, ellipsoid, … as in a scenario")
+    setter.add_argument("type", metavar="TYPE", help="one of those above")
     setter.add_argument("keys", metavar="KEY=VALUE", nargs="*", help="as in a scenario's [[obstacle]]; lists by commas")
+    setter.description = "Put an obstacle, or move it. Its type's own keys:\n\n" + "\n".join(
+        f"  {kind:12} {keys}" for kind, keys in KEYS_OF.items()
+    )
+    setter.description += (
+        "\n\nand of all: position_m, rpy_rad or wxyz, velocity_m_s, omega_rad_s, group, combine=union|sum.\n"
+        "A mesh is one that the daemon's config names in a [[mesh]]; a cloud's file is read here, thinned and sent."
+    )
     add_daemon(setter)
     clear = command(actions, "clear", "forget an obstacle", "rtctl obstacle clear --all", _clear)
     which = clear.add_mutually_exclusive_group(required=True)
@@ -98,7 +124,34 @@ def _set(arguments: argparse.Namespace) -> int:
     from rtctl.cli.values import assignments
 
     described = {"name": arguments.name, "type": arguments.type, **assignments(arguments.keys)}
+    if arguments.type == "cloud":
+        return _set_cloud(arguments, described)
     return _said(_demand(arguments, {"verb": "obstacle", "set": described}), f"obstacle {arguments.name}: set")
+
+
+def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
+    """Read the points here, where the file is, and send them as one binary message."""
+    from pathlib import Path
+
+    from rtctl.config.assets import load_cloud, placed
+    from rtctl.config.obstacles import Cloud, shape_of
+    from rtctl.config.scenario import parse_obstacle
+    from rtctl.hal.client import Session, accepted
+    from rtctl.hal.messages import cloud_message
+
+    cloud = parse_obstacle(described, "obstacle")
+    assert isinstance(cloud, Cloud)
+    assert cloud.file is not None
+    points = load_cloud(Path(cloud.file), cloud.point_radius_m, cloud.voxel_m, "obstacle: file")
+    shape = placed(shape_of(cloud), points)
+    table = {k: v for k, v in described.items() if k not in ("file", "voxel_m")} | {
+        "position_m": shape.position.tolist(),
+        "velocity_m_s": shape.velocity.tolist(),
+        "point_radius_m": points.radius,
+    }
+    with Session(daemon_of(arguments), arguments.reply) as session:
+        reply = accepted(session.ask_raw(cloud_message({"set": table, "step_m": points.step}, points.steps)))
+    return _said(reply, f"obstacle {arguments.name}: set, {points.points} points of radius {points.radius:.4g} m")
 
 
 def _clear(arguments: argparse.Namespace) -> int:
@@ -109,12 +162,22 @@ def _clear(arguments: argparse.Namespace) -> int:
 
 def _goal(arguments: argparse.Namespace) -> int:
     from rtctl.cli.goals import Outcome, send, send_and_wait
+    from rtctl.cli.values import letters
     from rtctl.hal.client import Session
 
     message: dict[str, Any] = {"verb": "goal", "position_m": [arguments.x, arguments.y, arguments.z]}
-    for key, value in (("rpy_rad", arguments.rpy), ("wxyz", arguments.wxyz), ("tolerance_m", arguments.tolerance)):
-        if value is not None:
-            message[key] = value
+    if arguments.axes == "none":
+        del message["position_m"]
+    elif arguments.axes is not None:
+        message["axes"] = letters(arguments.axes)
+    asked = {
+        "rpy_rad": arguments.rpy,
+        "wxyz": arguments.wxyz,
+        "direction": arguments.direction,
+        "tool_axis": arguments.tool_axis,
+        "tolerance_m": arguments.tolerance,
+    }
+    message |= {key: value for key, value in asked.items() if value is not None}
     if arguments.hold_orientation:
         message["hold"] = "orientation"
     with Session(daemon_of(arguments), arguments.reply) as session:

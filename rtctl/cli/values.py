@@ -9,10 +9,17 @@ from typing import Any
 from rtctl.errors import UsageError
 
 COLUMNS = {3: ("x", "y", "z"), 6: ("x", "y", "z", "roll", "pitch", "yaw"), 7: ("x", "y", "z", "qw", "qx", "qy", "qz")}
-GROUPS = {"position_m": ("x", "y", "z"), "rpy_rad": ("roll", "pitch", "yaw"), "wxyz": ("qw", "qx", "qy", "qz")}
+GROUPS = {
+    "position_m": ("x", "y", "z"),
+    "rpy_rad": ("roll", "pitch", "yaw"),
+    "wxyz": ("qw", "qx", "qy", "qz"),
+    "direction": ("dx", "dy", "dz"),
+}
 SINGLE = ("tolerance_m", "tolerance_rad")
-KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE
-WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz; or a JSON object"
+WORDS = ("axes", "tool_axis")
+KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE + WORDS
+NEEDED = (*GROUPS, "hold")  # one of them: where to go
+WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz or dx,dy,dz; or a JSON object"
 
 
 def assignments(words: Iterable[str]) -> dict[str, Any]:
@@ -62,8 +69,8 @@ def _from_json(text: str, place: str) -> dict[str, Any]:
         goal = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{place}: {error}") from None
-    if "position_m" not in goal:
-        raise UsageError(f"{place}: got no position_m, wanted it")
+    if not any(key in goal for key in NEEDED):
+        raise UsageError(f"{place}: got no goal, wanted one of {', '.join(NEEDED)}")
     return {**goal, "verb": "goal"}
 
 
@@ -78,7 +85,8 @@ def _header(cells: list[str], place: str) -> tuple[str, ...]:
 def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> dict[str, Any]:
     if len(cells) != len(names):
         raise UsageError(f"{place}: got {len(cells)} values, {f'wanted {len(names)}' if names else WANTED}")
-    row = {name: _number(cell, f"{place}: {name}") for name, cell in zip(names, cells, strict=True) if cell}
+    given_cells = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
+    row = {name: _number(cell, f"{place}: {name}") for name, cell in given_cells.items() if name not in WORDS}
     message: dict[str, Any] = {"verb": "goal"}
     for key, group in GROUPS.items():
         given = [name for name in group if name in row]
@@ -86,9 +94,18 @@ def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> dict[st
             raise UsageError(f"{place}: got {', '.join(given)} alone, wanted {', '.join(group)}")
         if given:
             message[key] = [row[name] for name in group]
-    if "position_m" not in message:
+    if not any(key in message for key in NEEDED):
         raise UsageError(f"{place}: got no position, {WANTED}")
+    if "axes" in given_cells:
+        message["axes"] = letters(given_cells["axes"])
+    if "tool_axis" in given_cells:
+        message["tool_axis"] = given_cells["tool_axis"]
     return message | {key: row[key] for key in SINGLE if key in row}
+
+
+def letters(text: str) -> list[str]:
+    """Return the axes of a word like xy, for the daemon to check."""
+    return [letter for letter in text if letter not in ", "]
 
 
 def _is_number(text: str) -> bool:

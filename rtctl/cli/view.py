@@ -88,7 +88,15 @@ def _task(status: dict[str, Any]) -> Table:
     late = "-" if lateness is None else f"{lateness * 1e6:.0f} us late"
     table = Table.grid(padding=(0, 3))
     table.add_row("tip ", f"{_vector(status.get('x_m'))} m", "time", f"{status.get('time_s') or 0.0:.2f} s")
-    table.add_row("goal", f"{_vector(goal)} m" if goal is not None else "none", "tick", loop)
+    task = status.get("task") or ""
+    aim = (
+        "none"
+        if goal is None
+        else f"{_vector(goal)} m"
+        if task in ("", "position", "pose")
+        else f"{task} of {_vector(goal)} m"
+    )
+    table.add_row("goal", aim, "tick", loop)
     table.add_row("error", error, "wake", late)
     return table
 

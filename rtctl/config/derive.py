@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.config import rules
-from rtctl.config.obstacles import quaternion, shape_of
+from rtctl.config.assets import Assets, load_assets, placed
+from rtctl.config.goal import task_of
+from rtctl.config.obstacles import Obstacle, quaternion, shape_of
 from rtctl.config.read import name_place
 from rtctl.config.structs import Config
 from rtctl.config.urdf import package_folders, urdf_file
@@ -15,6 +17,7 @@ from rtctl.control.estimator import JointParams, design, design_joint, tip_param
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
 from rtctl.control.law import prepared
+from rtctl.control.mobility import mobility
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own, nothing, watched
@@ -22,10 +25,13 @@ from rtctl.control.points import Coverage, Points
 from rtctl.control.primitives import distance
 from rtctl.control.robot import SLOTS, Robot, StopParams
 from rtctl.control.so3 import R_of
+from rtctl.control.watch import SHARE
 from rtctl.errors import ConfigError
 from rtctl.types import F64, Shape
 
 POSTURES = 256  # sampled for torque and inertia extremes
+FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
+VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
 P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
 
 
@@ -49,9 +55,11 @@ def build(config: Config, path: str | Path) -> Robot:
     home = np.array(config.robot.home_rad)
     found = extremes(config, body)
     _refuse_torque(config, found, source)
+    _refuse_axes(config, body, source)
     points, coverage, own = _geometry(config, body, home, source)
-    obstacles = tuple(shape_of(o) for o in config.obstacle)
-    _refuse_contact(obstacles, body, points, home, source)
+    assets = load_assets(config.mesh, config.obstacle, Path(path))
+    obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
+    _refuse_contact(obstacles, assets, body, points, home, source)
     rest = config.motion.posture.q_rest_rad
     tau_rated = np.array([j.tau_max_Nm for j in joints])
     robot = Robot(
@@ -78,6 +86,7 @@ def build(config: Config, path: str | Path) -> Robot:
         coverage=coverage,
         own=own,
         obstacles=obstacles,
+        meshes=assets.meshes,
         motion=_motion(config),
         avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
         self_avoid=_field(
@@ -85,6 +94,7 @@ def build(config: Config, path: str | Path) -> Robot:
         ),
         limit=_limit(config),
         **_filters(config, body, home),
+        carry=config.estimator.carry,
         safety=_safety(config, tau_rated),
         stop=StopParams(
             damping=config.safety.stop_damping * found.inertia_home,
@@ -95,6 +105,7 @@ def build(config: Config, path: str | Path) -> Robot:
         scratch=field_buffers(SLOTS, len(points.link), len(joints)),
         tolerance=config.motion.tolerance_m,
         tolerance_rot=config.motion.tolerance_rad,
+        axes=task_of(config.motion.axes),
     )
     return prepared(robot)
 
@@ -192,11 +203,19 @@ def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[
     return points, coverage, own
 
 
-def _refuse_contact(obstacles: tuple[Shape, ...], body: RigidBody, points: Points, home: F64, source: str) -> None:
+def loaded_shape(obstacle: Obstacle, assets: Assets) -> Shape:
+    """Return the obstacle as the controller takes it, a cloud with its points."""
+    shape = shape_of(obstacle)
+    return placed(shape, assets.clouds[obstacle.name]) if obstacle.name in assets.clouds else shape
+
+
+def _refuse_contact(
+    obstacles: tuple[Shape, ...], assets: Assets, body: RigidBody, points: Points, home: F64, source: str
+) -> None:
     """Refuse an obstacle of the config that the arm touches at home."""
     P = body.evaluate(home, np.zeros(body.n), points).P
     for i, shape in enumerate(obstacles):
-        rho = distance(shape, P)[0] - points.radius
+        rho = distance(shape, P, assets.meshes)[0] - points.radius
         if rho.min() <= 0.0:
             place = name_place(source, f"obstacle[{i}].position_m")
             got = f"{shape.name} {-rho.min():.3g} m inside the points of {points.names[int(rho.argmin())]} at home"
@@ -214,6 +233,17 @@ def _reach(config: Config, body: RigidBody) -> float:
         total += float(np.linalg.norm(t - base if parent == 0 else t))
         joint = parent
     return total
+
+
+def _refuse_axes(c: Config, body: RigidBody, source: str) -> None:
+    """Raise ConfigError for an axis of the task along or about which the tip never moves."""
+    q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
+    never = mobility(body, q_min, q_max)
+    for i, axis in enumerate(c.motion.axes):
+        lost = never.unturned if axis.startswith("r") else never.still
+        if np.linalg.norm(lost[:, "xyz".index(axis[-1])]) > 1.0 - 1e-6:
+            place = name_place(source, f"motion.axes[{i}]")
+            raise ConfigError(place, axis, "an axis along (x) or about (rx) which this arm can move")
 
 
 def _motion(c: Config) -> MotionParams:
@@ -278,11 +308,25 @@ def _safety(c: Config, tau_rated: F64) -> SafetyParams:
         stale_periods=int(s.stale_hold_ms / period + 1e-9),
         lost_periods=int(s.stale_stop_ms / period + 1e-9),
         torque_tolerance=s.torque_error_ratio * tau_rated,
+        friction=FRICTION * s.torque_error_ratio * tau_rated,
+        velocity_tolerance=_velocity_tolerance(c),
         speed_tolerance=s.speed_ratio,
         limit_tolerance=s.limit_excess_rad,
         innovation_max=c.estimator.innovation_sigma,
         feed_timeout=s.obstacle_stale_s,
+        creep=c.avoid.obstacle_speed_m_s,
     )
+
+
+def _velocity_tolerance(c: Config) -> F64:
+    """Return the bound (n,) [rad/s] of positions against speed: a share of qd_max, and what rounding leaves."""
+    if not c.estimator.joint_velocity:
+        return np.full(len(c.robot.joints), np.finfo(np.float64).max)  # they report no speed worth comparing
+    step = np.array([2.0 * s.p_max / (2**P_BITS - 1) for s in rules.scales(c)])
+    noise = np.hypot(step, c.estimator.position_noise_rad) * c.loop.servo_hz
+    qd_max = np.array([j.qd_max_rad_s for j in c.robot.joints])
+    bound: F64 = VELOCITY_SHARE * qd_max + 2.0 * SHARE * noise
+    return bound
 
 
 def _no_points() -> Points:

@@ -4,7 +4,7 @@ Axis of capsule, segment, cylinder, cone, n_cylinder: local z. A plane is solid 
 """
 
 from itertools import pairwise
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -24,6 +24,8 @@ Speed = Annotated[float, Meta(ge=-20.0, le=20.0)]
 Time = Annotated[float, Meta(ge=0.0, le=1e6)]
 Exponent = Annotated[float, Meta(ge=1.0, le=50.0)]
 
+File = Annotated[str, Meta(min_length=1, max_length=255)]
+
 Place = tuple[Coordinate, Coordinate, Coordinate]
 Extents = tuple[Extent, Extent, Extent]
 RollPitchYaw = tuple[Turn, Turn, Turn]
@@ -37,6 +39,8 @@ class Posed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
 
     At rest or at constant velocity: `position_m` is where it is at `appears_s`. Along `waypoints` ([t, x, y, z], t from
     the start of the scenario): straight lines between them, at rest before the first and after the last.
+    Obstacles of one `group` are one obstacle: of a union the part nearest to a point of the arm acts on that point; in
+    a sum, as among obstacles without a group, all do.
     """
 
     name: Name
@@ -48,6 +52,8 @@ class Posed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
     waypoints: Annotated[tuple[Waypoint, ...], Meta(max_length=256)] = ()
     appears_s: Time = 0.0
     vanishes_s: Time = 1e6
+    group: Name | None = None
+    combine: Literal["union", "sum"] | None = None  # None: union, if there is a group
 
 
 class Sphere(Posed, tag="sphere", frozen=True, kw_only=True):
@@ -121,8 +127,43 @@ class Cone(Posed, tag="cone", frozen=True, kw_only=True):
     top_radius_m: Annotated[float, Meta(ge=0.0, le=50.0)] = 0.0
 
 
+class Mesh(Posed, tag="mesh", frozen=True, kw_only=True):
+    """A closed surface of triangles: `mesh` of the config by its name, or a `file` (STL, OBJ) beside the one it is in.
+
+    scale: metres of a unit of the file. hull: the convex hull, for a surface that is open or crosses itself.
+    """
+
+    mesh: Name | None = None
+    file: File | None = None
+    scale: Annotated[float, Meta(ge=1e-6, le=1e4)] = 1.0
+    hull: bool = False
+
+
+class Cloud(Posed, tag="cloud", frozen=True, kw_only=True):
+    """Balls of `point_radius_m` about the points of a `file` (NPY, XYZ, PLY) beside the one it is named in.
+
+    voxel_m: one point stands for all in a cube of this size, and the radius grows by what that moves them.
+    """
+
+    point_radius_m: Annotated[float, Meta(ge=0.0, le=1.0)]
+    file: File | None = None
+    voxel_m: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+
+
 Obstacle = (
-    Sphere | PointObstacle | Capsule | Segment | Cylinder | Box | Plane | Ellipsoid | NEllipsoid | NCylinder | Cone
+    Sphere
+    | PointObstacle
+    | Capsule
+    | Segment
+    | Cylinder
+    | Box
+    | Plane
+    | Ellipsoid
+    | NEllipsoid
+    | NCylinder
+    | Cone
+    | Mesh
+    | Cloud
 )
 
 
@@ -149,7 +190,9 @@ def dims_of(obstacle: Obstacle) -> F64:
             d = (*obstacle.semi_axes_m, obstacle.n)
         case Cone():
             d = (obstacle.radius_m, obstacle.top_radius_m, 0.5 * obstacle.height_m)
-        case _:  # point and plane have none
+        case Cloud():
+            d = (obstacle.point_radius_m,)
+        case _:  # point, plane and mesh have none
             d = ()
     out = np.zeros(4)
     out[: len(d)] = d
@@ -205,8 +248,13 @@ def pose_at(obstacle: Obstacle, t: float) -> Pose:
     return Pose(w[k - 1, 1:] + velocity * (t - w[k - 1, 0]), velocity, present)
 
 
+def mesh_key(mesh: Mesh) -> str:
+    """Return the name of an obstacle's mesh among the robot's; one of a file of its own is no name anybody can say."""
+    return mesh.mesh or f"@{mesh.name}"
+
+
 def shape_of(obstacle: Obstacle, t: float = 0.0) -> Shape:
-    """Return the obstacle as the controller takes it, where it is at time t [s] of the scenario."""
+    """Return the obstacle as the controller takes it, where it is at time t [s]; a cloud still without its points."""
     pose = pose_at(obstacle, t)
     return Shape(
         name=obstacle.name,
@@ -216,6 +264,8 @@ def shape_of(obstacle: Obstacle, t: float = 0.0) -> Shape:
         wxyz=orientation_of(obstacle, t),
         velocity=pose.velocity,
         omega=np.array(obstacle.omega_rad_s),
+        group="" if obstacle.group is None or obstacle.combine == "sum" else obstacle.group,
+        mesh=mesh_key(obstacle) if isinstance(obstacle, Mesh) else "",
     )
 
 
@@ -233,6 +283,12 @@ def contradiction(o: Obstacle) -> tuple[str, Any, str] | None:
             return "waypoints", t, "times that rise by at least 1 ms"
     if o.vanishes_s <= o.appears_s:
         return "vanishes_s", o.vanishes_s, f"more than appears_s = {o.appears_s:g}"
+    if o.combine is not None and o.group is None:
+        return "combine", o.combine, "a group beside it"
+    if isinstance(o, Mesh) and (o.mesh is None) == (o.file is None):
+        return "mesh", "neither it nor file" if o.mesh is None else f"{o.mesh} and a file", "one of the two"
+    if isinstance(o, Mesh) and o.mesh is not None and (o.hull or o.scale != 1.0):
+        return "mesh", o.mesh, "no scale or hull beside it: its [[mesh]] has them"
     if isinstance(o, Plane) and o.normal is not None:
         if o.rpy_rad is not None or o.wxyz is not None:
             return "normal", list(o.normal), "nothing beside rpy_rad or wxyz"
@@ -255,6 +311,7 @@ def orientation_contradiction(rpy: object, wxyz: tuple[float, ...] | None) -> tu
 def refuse_obstacles(obstacles: tuple[Obstacle, ...], source: str, one: bool = False) -> None:
     """Raise ConfigError for the first obstacle whose keys contradict each other or whose name is taken."""
     names: set[str] = set()
+    combined: dict[str, str] = {}
     for i, obstacle in enumerate(obstacles):
         inside = "" if one else f"obstacle[{i}]."
         found = contradiction(obstacle)
@@ -263,3 +320,10 @@ def refuse_obstacles(obstacles: tuple[Obstacle, ...], source: str, one: bool = F
         if obstacle.name in names:
             raise ConfigError(name_place(source, f"{inside}name"), obstacle.name, "a name not used before")
         names.add(obstacle.name)
+        if isinstance(obstacle, Cloud) and obstacle.file is None:
+            raise ConfigError(name_place(source, f"{inside}file"), "nothing", "an NPY, XYZ or PLY file")
+        if obstacle.group is not None:
+            how = combined.setdefault(obstacle.group, obstacle.combine or "union")
+            if how != (obstacle.combine or "union"):
+                place = name_place(source, f"{inside}combine")
+                raise ConfigError(place, obstacle.combine or "union", f"{how}, as the rest of group {obstacle.group}")

@@ -128,6 +128,10 @@ def _distances(c: Config) -> Iterator[Found]:
         ("joint_", a.joint_influence_rad, a.joint_clearance_rad, joint_speed(c, i), "rad")
         for i in range(len(c.robot.joints))
     ]
+    axes = c.motion.axes
+    for i, axis in enumerate(axes):
+        if axis in axes[:i]:
+            yield Found(f"motion.axes[{i}]", axis, "each axis once")
     for prefix, rho0, rho_min, speed, unit in zones:
         if rho_min >= rho0:
             key = f"avoid.{prefix}clearance_{unit}"

@@ -5,35 +5,36 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
+from rtctl.config.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.config.obstacles import (
     Name,
     Obstacle,
     Orientation,
     Place,
     RollPitchYaw,
-    orientation_contradiction,
-    quaternion,
     refuse_obstacles,
     shape_of,
 )
 from rtctl.config.read import convert, name_place, read
 from rtctl.config.structs import Angles, Key, Table, Text
 from rtctl.errors import ConfigError
-from rtctl.types import F64, Goal, ObstacleEdit, Task
+from rtctl.types import F64, Goal, ObstacleEdit
 
 Moment = Annotated[float, Meta(ge=0.0, le=3600.0)]
 
 
 class GoalTable(Table, frozen=True, kw_only=True):
-    """A goal of the tip; without an orientation the task is position alone."""
+    """A goal of the tip: position (or `axes` of it), orientation, direction of a tool axis; the rest stays free."""
 
-    position_m: Place
+    position_m: Place | None = None
+    axes: Axes | None = None  # None: all three
     wxyz: Orientation | None = None
     rpy_rad: RollPitchYaw | None = None
     hold: Literal["orientation"] | None = None
+    direction: Direction | None = None
+    tool_axis: ToolAxis | None = None  # None: z
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=1.0)] | None = None
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=3.2)] | None = None
 
@@ -101,9 +102,16 @@ def robot_file(scenario: Scenario, path: str | Path) -> Path:
     return found
 
 
-def scenario_dict(scenario: Scenario) -> dict[str, Any]:
-    """Return the scenario as the plain values of its TOML, defaults filled in and absent keys left out."""
-    return dict(_without_none(msgspec.to_builtins(scenario)))
+def scenario_dict(scenario: Scenario, path: str | Path = "scenario.toml") -> dict[str, Any]:
+    """Return the scenario as the plain values of its TOML, defaults filled in and absent keys left out.
+
+    Files of meshes and clouds, relative to `path`, become absolute.
+    """
+    plain = dict(_without_none(msgspec.to_builtins(scenario)))
+    for table in plain["obstacle"]:
+        if "file" in table:
+            table["file"] = str(Path(path).resolve().parent / table["file"])
+    return plain
 
 
 def _without_none(value: Any) -> Any:
@@ -132,14 +140,7 @@ def goal_of(goal: GoalTable, wxyz: F64, tolerance: float, tolerance_rot: float) 
     wxyz (4,): the tip's orientation now, kept by hold = "orientation". tolerance [m], tolerance_rot [rad]: the robot's,
     for a goal that gives none.
     """
-    free = goal.wxyz is None and goal.rpy_rad is None and goal.hold is None
-    return Goal(
-        position=np.array(goal.position_m),
-        wxyz=np.array(wxyz, dtype=np.float64) if free or goal.hold else quaternion(goal.rpy_rad, goal.wxyz),
-        task=Task.POSITION if free else Task.POSE,
-        tolerance=tolerance if goal.tolerance_m is None else goal.tolerance_m,
-        tolerance_rot=tolerance_rot if goal.tolerance_rad is None else goal.tolerance_rad,
-    )
+    return goal_from(goal, lambda: wxyz, tolerance, tolerance_rot)
 
 
 def edit_of(obstacle: Obstacle, age: float = 0.0) -> ObstacleEdit:
@@ -148,8 +149,5 @@ def edit_of(obstacle: Obstacle, age: float = 0.0) -> ObstacleEdit:
 
 
 def _refuse_goal(goal: GoalTable, source: str, inside: str) -> None:
-    found = orientation_contradiction(goal.rpy_rad, goal.wxyz)
-    if found is None and goal.hold and (goal.rpy_rad is not None or goal.wxyz is not None):
-        found = "hold", goal.hold, "nothing beside wxyz or rpy_rad"
-    if found is not None:
+    if found := goal_contradiction(goal):
         raise ConfigError(name_place(source, inside + found[0]), found[1], found[2])

@@ -15,6 +15,7 @@ Key = Annotated[str, Meta(min_length=1, max_length=64)]  # a name inside the URD
 Angle = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Angles = Annotated[tuple[Angle, ...], Meta(min_length=1, max_length=15)]
 Rate = Annotated[float, Meta(ge=10.0, le=4000.0)]
+Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 Milliseconds = Annotated[float, Meta(ge=0.1, le=1000.0)]
 
 
@@ -34,6 +35,7 @@ class Joint(Table, frozen=True, kw_only=True):
     tau_rate_Nm_s: Annotated[float, Meta(ge=1.0, le=1e6, description="largest change of torque")]
     drive: Annotated[Name, Meta(description="a drive of the catalogue or of [drives]: its scales on the wire")]
     armature_kg_m2: Annotated[float, Meta(ge=0.0, le=100.0, description="motor inertia seen at the joint, J G^2")] = 0.0
+    friction_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="viscous, seen at the joint, B G^2")] = 0.0
 
 
 class BasePose(Table, frozen=True, kw_only=True):
@@ -111,6 +113,10 @@ class Motion(Table, frozen=True, kw_only=True):
     )
     singular_1_kg: Annotated[float, Meta(ge=1e-4, le=10.0, description="eigenvalue of J A^-1 J^T damped below")] = 0.02
     length_m: Annotated[float, Meta(ge=0.01, le=2.0, description="makes angular rows comparable to linear ones")] = 0.2
+    axes: Annotated[
+        tuple[Axis, ...],
+        Meta(min_length=1, max_length=6, description="world axes along (x) and about (rx) which the tip can move"),
+    ] = ("x", "y", "z", "rx", "ry", "rz")
     posture: Posture = Posture()
 
 
@@ -136,6 +142,9 @@ class Avoid(Table, frozen=True, kw_only=True):
     joint_influence_rad: Annotated[float, Meta(ge=0.01, le=1.0, description="zone of the joint-limit potential")] = 0.2
     joint_clearance_rad: Annotated[float, Meta(ge=0.002, le=0.5)] = 0.03
     joint_braking_s: Annotated[float, Meta(ge=0.02, le=2.0, description="from qd_max to rest, before a limit")] = 0.2
+    obstacle_speed_m_s: Annotated[
+        float, Meta(ge=0.0, le=5.0, description="speed of obstacles beside the one told; times age it widens them")
+    ] = 0.1
     joint_speed_rad_s: Annotated[float, Meta(ge=0.05, le=50.0, description="spent at the joint clearance")] = 1.5
 
 
@@ -152,6 +161,9 @@ class Estimator(Table, frozen=True, kw_only=True):
     velocity_noise_rad_s: Annotated[float, Meta(ge=0.0, le=5.0, description="of a drive, beside its step")] = 0.0
     joint_velocity: Annotated[bool, Meta(description="the drives report a velocity worth using")] = True
     innovation_sigma: Annotated[float, Meta(ge=3.0, le=50.0)] = 8.0
+    carry: Annotated[
+        bool, Meta(description="tip and points between evaluations; false holds them still, to compare")
+    ] = True
 
 
 class Safety(Table, frozen=True, kw_only=True):
@@ -201,6 +213,17 @@ class DriveTable(Table, frozen=True, kw_only=True):
     t_max_Nm: Annotated[float, Meta(ge=0.01, le=5000.0)]
 
 
+class MeshTable(Table, frozen=True, kw_only=True):
+    """A solid that obstacles may refer to by name, those told to the running daemon included."""
+
+    name: Name
+    file: Annotated[Text, Meta(description="STL or OBJ, relative to this file")]
+    scale: Annotated[float, Meta(ge=1e-6, le=1e4, description="metres of a unit of the file")] = 1.0
+    hull: Annotated[bool, Meta(description="take the convex hull: for a surface that is open or crosses itself")] = (
+        False
+    )
+
+
 class Config(Table, frozen=True, kw_only=True):
     """One robot, one file."""
 
@@ -215,3 +238,4 @@ class Config(Table, frozen=True, kw_only=True):
     console: ConsoleTable = ConsoleTable()
     drives: Annotated[dict[Name, DriveTable], Meta(max_length=64)] = {}
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
+    mesh: Annotated[tuple[MeshTable, ...], Meta(max_length=32)] = ()

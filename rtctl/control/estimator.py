@@ -74,6 +74,15 @@ def start(x: F64, R: F64, design: Design) -> TipEstimate:
     return TipEstimate(x.copy(), np.zeros(3), design.P.copy(), R.copy(), np.zeros(3), design.P_rot.copy())
 
 
+def held(est: TipEstimate, x: F64, R: F64, J: F64, qd: F64) -> TipEstimate:
+    """Return the tip as one evaluation knows it, unfiltered: what a servo without estimator holds until the next.
+
+    x (3,) [m], R (3, 3), J (6, n) of the evaluation; qd (n,) [rad/s].
+    """
+    twist = matvec(J, qd)
+    return est._replace(x=x.copy(), xd=twist[:3].copy(), R=R.copy(), omega=twist[3:].copy())
+
+
 def predict(est: TipEstimate, a: F64, alpha: F64, dt: float, params: EstimatorParams) -> TipEstimate:
     """Return the estimate dt later: x += xd dt + a dt^2/2, xd += a dt, R <- exp(omega dt + alpha dt^2/2) R.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rtctl.types import F64, I64, Feedback, Link, Severity, State
+from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
 JUMP_WINDOW = 50  # cycles in which a second jump makes a fault of a glitch
 GOOD_TICKS = 50  # an automatic fault clears after this many ticks without it
@@ -50,7 +50,9 @@ FAULTS = (
     Fault("drive_fault", 15, Severity.SS1, "R", "a drive reports a fault"),
     Fault("drive_disabled", 17, Severity.SS1, "R", "a drive left the enabled state by itself"),
     Fault("torque_mismatch", 18, Severity.SS1, "R", "a drive's torque is not the one it was sent"),
+    Fault("encoder_stuck", 19, Severity.SS1, "R", "a position stands still though the joint must move"),
     Fault("encoder_jump", 20, Severity.SS1, "R", "a position jumped twice by more than the joint can move"),
+    Fault("velocity_mismatch", 21, Severity.SS1, "R", "a joint's speed is not that of its positions"),
     Fault("not_finite", 25, Severity.SS1, "L", "a state or torque was not finite"),
     Fault("deadline", 30, Severity.SS2, "R", "3 slots running, or 10 periods, were missed"),
     Fault("goal_in_obstacle", 43, Severity.SS2, "A", "the goal lies inside an obstacle"),
@@ -65,7 +67,11 @@ INDEX = {fault.name: i for i, fault in enumerate(FAULTS)}
 BIT = {fault.name: 1 << i for i, fault in enumerate(FAULTS)}
 REFUSES_ARMING = ~BIT["duplicate_reply"]  # every other fault, while present, refuses arming
 _AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
-_CORRUPT, _SEND_FAILED = int(Link.CORRUPT), int(Link.SEND_FAILED)  # plain integers: a flag's & is slow
+_CORRUPT, _SEND_FAILED, _DERATED = (
+    int(Link.CORRUPT),
+    int(Link.SEND_FAILED),
+    int(Link.DERATED),
+)  # plain integers: a flag's & is slow
 _BY_LINK = tuple(
     (int(flag), BIT[name])
     for flag, name in (
@@ -80,7 +86,7 @@ _BY_LINK = tuple(
     )
 )
 # What `_scan` sees at some joint.
-_UNHEARD, _FAULT, _DISABLED, _TORQUE, _JUMPED, _OUTSIDE, _FAST, _NOT_FINITE = (1 << i for i in range(8))
+_UNHEARD, _FAULT, _DISABLED, _TORQUE, _OUTSIDE, _FAST, _NOT_FINITE = (1 << i for i in range(7))
 
 
 class SafetyParams(NamedTuple):
@@ -89,20 +95,26 @@ class SafetyParams(NamedTuple):
     stale_periods: int  # SS2 beyond it
     lost_periods: int  # SS1 beyond it
     torque_tolerance: F64  # (n,) [Nm] of sent against echoed torque
+    friction: F64  # (n,) [Nm] that may hold a joint against the model
+    velocity_tolerance: F64  # (n,) [rad/s] of the filtered difference of speeds
     speed_tolerance: float  # overspeed beyond this fraction of qd_max
     limit_tolerance: float  # [rad] beyond a joint limit before it is a fault
     innovation_max: float  # [standard deviations]
     feed_timeout: float  # [s] of a moving obstacle's observation
+    creep: float = 0.1  # [m/s] speed that observed obstacles may have beside the one that is told
 
 
 class Evidence(NamedTuple):
     """What the pipe tells the detectors beside the feedback."""
 
     active: bool  # drives are meant to be enabled
+    powered: bool  # torque flows, or is being switched on
     torque_low: F64  # (n,) [Nm] smallest of the torques the echo may answer to
     torque_high: F64  # (n,) [Nm] largest of them
-    q_previous: F64  # (n,) [rad] feedback of the previous tick
-    age_previous: F64  # (n,) [s] how old that was
+    jumped: bool  # a joint's position was dropped: further than it can have moved
+    stuck: bool  # an encoder repeats itself; see `watch`
+    disagree: bool  # a joint's positions and speed disagree
+    pulled: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
     contact: bool
@@ -118,18 +130,34 @@ class Counters(NamedTuple):
     send_failed: int = 0
     disabled: int = 0
     mismatch: int = 0
+    pulled: int = 0
     jumps: int = 0  # last JUMP_WINDOW cycles, one bit each
     missed: int = 0
     innovation: int = 0
 
 
 @njit(cache=True, fastmath=False)
+def jumped(
+    q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
+) -> B1:
+    """Return which joints (n,) report a position [rad] that they cannot have reached since the last one believed.
+
+    q_previous was `age_previous` [s] old `elapsed` [s] ago, q is `age` [s] old now; dt [s] is the servo period.
+    """
+    out = np.zeros(q.shape[0], np.bool_)
+    for i in range(q.shape[0]):
+        apart = elapsed + age_previous[i] - age[i]  # of the two measurements
+        reach = 1.5 * qd_max[i] * max(apart, dt) + 2e-3  # two quantisation steps of a coarse encoder
+        out[i] = replies[i] > 0 and np.isfinite(q[i]) and abs(q[i] - q_previous[i]) > reach
+    return out
+
+
+@njit(cache=True, fastmath=False)
 def _scan(
-    q: F64, qd: F64, tau: F64, age: F64, replies: I64, drive: I64, q_previous: F64, age_previous: F64,
-    torque_low: F64, torque_high: F64, torque_tolerance: F64, q_min: F64, q_max: F64, qd_max: F64,
-    limit_tolerance: float, speed_tolerance: float, periods: int, dt: float,
+    q: F64, qd: F64, tau: F64, age: F64, drive: I64, torque_low: F64, torque_high: F64, torque_tolerance: F64,
+    q_min: F64, q_max: F64, qd_max: F64, limit_tolerance: float, speed_tolerance: float,
 ) -> tuple[float, int]:  # fmt: skip
-    """Return the greatest age [s] and what was seen at any joint; `periods` of dt [s] passed since q_previous."""
+    """Return the greatest age [s] and what was seen at any joint."""
     oldest, seen = 0.0, 0
     for i in range(q.shape[0]):
         oldest = age[i] if age[i] > oldest else oldest
@@ -141,10 +169,6 @@ def _scan(
             seen |= _DISABLED
         if tau[i] < torque_low[i] - torque_tolerance[i] or tau[i] > torque_high[i] + torque_tolerance[i]:
             seen |= _TORQUE
-        apart = dt * periods + age_previous[i] - age[i]  # of the two measurements
-        reach = 1.5 * qd_max[i] * max(apart, dt) + 2e-3  # two quantisation steps of a coarse encoder
-        if replies[i] > 0 and abs(q[i] - q_previous[i]) > reach:
-            seen |= _JUMPED
         if q[i] < q_min[i] - limit_tolerance or q[i] > q_max[i] + limit_tolerance:
             seen |= _OUTSIDE
         if abs(qd[i]) > speed_tolerance * qd_max[i]:
@@ -160,8 +184,8 @@ def detect(
     """Return the bits of the faults present at this tick and the counters for the next."""
     f, link = feedback, feedback.link
     age, seen = _scan(
-        f.q, f.qd, f.tau, f.age, f.replies, f.drive, e.q_previous, e.age_previous, e.torque_low, e.torque_high,
-        p.torque_tolerance, q_min, q_max, qd_max, p.limit_tolerance, p.speed_tolerance, 1 + f.missed, dt,
+        f.q, f.qd, f.tau, f.age, f.drive, e.torque_low, e.torque_high, p.torque_tolerance,
+        q_min, q_max, qd_max, p.limit_tolerance, p.speed_tolerance,
     )  # fmt: skip
     half = 0.5 * dt  # ages are whole periods; half a one keeps rounding out of the comparison
     n = Counters(
@@ -169,7 +193,8 @@ def detect(
         send_failed=c.send_failed + 1 if link & _SEND_FAILED else 0,
         disabled=c.disabled + 1 if e.active and seen & _DISABLED else 0,
         mismatch=c.mismatch + 1 if e.active and seen & _TORQUE else 0,
-        jumps=((c.jumps << 1) | bool(seen & _JUMPED)) & ((1 << JUMP_WINDOW) - 1) if e.active else 0,
+        pulled=c.pulled + 1 if e.active and e.pulled and not link & _DERATED else 0,
+        jumps=((c.jumps << 1) | e.jumped) & ((1 << JUMP_WINDOW) - 1) if e.active else 0,
         missed=c.missed + 1 if f.missed else 0,
         innovation=c.innovation + 1 if e.active and not e.innovation <= p.innovation_max else 0,
     )
@@ -180,10 +205,12 @@ def detect(
         "send_failed": n.send_failed >= 2,
         "drive_fault": seen & _FAULT,
         "drive_disabled": n.disabled >= 5,
-        "torque_mismatch": n.mismatch >= 5,
+        "torque_mismatch": n.mismatch >= 5 or n.pulled >= 5,
+        "encoder_stuck": e.stuck,
+        "velocity_mismatch": e.disagree,
         "encoder_jump": n.jumps.bit_count() >= 2,
         "not_finite": e.not_finite or seen & _NOT_FINITE,
-        "deadline": n.missed >= 3 or f.missed >= 10,
+        "deadline": e.powered and (n.missed >= 3 or f.missed >= 10),
         "goal_in_obstacle": e.goal_inside,
         "contact": e.contact and e.active,
         "feed_stale": e.feed_age > p.feed_timeout,

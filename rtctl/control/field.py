@@ -3,7 +3,9 @@
     f = lambda (a + d) n,    lambda = 1 / (n^T J A^-1 J^T n),    tau_obstacles = sum over points and obstacles of J^T f
 
 with a, d of `firas`, the true distance rho and its unit normal n = d rho/d p. lambda a is the force that gives the
-point the acceleration a along n; the denominator has a floor, so no pair exceeds 2 m_max a(rho_num). An obstacle that
+point the acceleration a along n. Below 1/m_max = b0 the mobility b = n^T J A^-1 J^T n gives lambda = b/b0^2, which goes
+to zero: a point that hardly moves cannot flee, and the arm is not to be flung about for it. So no pair exceeds
+2 m_max a(rho_num). An obstacle that
 comes towards a point widens rho0 by its own speed along n times the look-ahead. Its own, not the closing speed: the
 arm's motion would otherwise feed back into the zone and break the energy balance that eta comes from.
 """
@@ -74,6 +76,7 @@ def _repel(points: F64, p: F64, v: F64, w: F64, k: int, params: FieldParams, pai
     """
     rho0, rho_min, rho_num, eta, k_d = params.rho0, params.rho_min, params.rho_num, params.eta, params.k_d
     look_ahead, soft, floor = params.look_ahead, params.v_smooth, 1.0 / params.m_max
+    heavy = params.m_max * params.m_max
     px, py, pz, vx, vy, vz, wx, wy, wz = p[k, 0], p[k, 1], p[k, 2], v[k, 0], v[k, 1], v[k, 2], w[k, 0], w[k, 1], w[k, 2]
     for j in range(points.shape[1]):
         x, y, z = pairs[k, _N, j], pairs[k, _N + 1, j], pairs[k, _N + 2, j]
@@ -85,7 +88,7 @@ def _repel(points: F64, p: F64, v: F64, w: F64, k: int, params: FieldParams, pai
         b = x * x * points[_B, j] + y * y * points[_B + 1, j] + z * z * points[_B + 2, j]
         b += 2.0 * (x * y * points[_B + 3, j] + x * z * points[_B + 4, j] + y * z * points[_B + 5, j])
         pairs[k, _A, j] = a
-        pairs[k, _PUSH, j] = (a + d) / (floor if b <= floor else b)
+        pairs[k, _PUSH, j] = (a + d) * (b * heavy if b <= floor else 1.0 / b)
 
 
 @njit(cache=True, fastmath=False)

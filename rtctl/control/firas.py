@@ -16,6 +16,7 @@ from numba import njit
 
 from rtctl.types import F64, I64
 
+CAP_SHARE = 0.5  # of the clearance, where the repulsion is capped at the latest
 CAPPED, CONTACT = 1, 2  # flags: some counted distance below rho_num; at or below 0
 
 
@@ -24,7 +25,7 @@ class FieldParams(NamedTuple):
 
     rho0: float  # [m] influence
     rho_min: float  # [m] clearance: where a unit mass that enters at v_max turns
-    rho_num: float  # [m] below it the sampled force is capped
+    rho_num: float  # [m] below it the force is capped: at least the bound of a sampled spring
     eta: float  # [m4/s2]
     k_d: float  # [1/s] of the one-sided damping, at rho_min and below
     look_ahead: float  # [s] an obstacle's speed towards the point times this widens rho0
@@ -75,7 +76,11 @@ def rho_num_of(eta: float, dt: float) -> float:
 
 
 def _derived(v_max: float, rho0: float, rho_min: float, dt: float, damping_ratio: float) -> tuple[float, float, float]:
-    """Return (rho_num, eta, k_d), or raise ValueError unless 0 < rho_num < rho_min < rho0."""
+    """Return (where the cap begins, eta, k_d), or raise ValueError unless 0 < rho_num < rho_min < rho0.
+
+    The cap begins at CAP_SHARE of the clearance or at rho_num, whichever is larger: closer in no motor follows, and a
+    force that only grows would drown what other obstacles say.
+    """
     if not 0.0 < rho_min < rho0:
         raise ValueError(f"wanted 0 < clearance < influence, got {rho_min} and {rho0}")
     eta = eta_of(v_max, rho0, rho_min)
@@ -83,7 +88,8 @@ def _derived(v_max: float, rho0: float, rho_min: float, dt: float, damping_ratio
     if not 0.0 < rho_num < rho_min:
         raise ValueError(f"wanted a clearance above rho_num = {rho_num:.4g} (positive) at this rate, got {rho_min}")
     # 0.5/dt: a damper sampled with one period of delay is calm below it.
-    return rho_num, eta, min(2.0 * damping_ratio * math.sqrt(3.0 * eta) / rho_min**2, 0.5 / dt)
+    k_d = min(2.0 * damping_ratio * math.sqrt(3.0 * eta) / rho_min**2, 0.5 / dt)
+    return max(rho_num, CAP_SHARE * rho_min), eta, k_d
 
 
 def field_params(

@@ -11,17 +11,16 @@ import numpy as np
 from numba import njit
 
 from rtctl.control.field import CAPPED, Field, FieldParams, LimitParams, field, joint_limit_field, own_field
+from rtctl.control.guards import approach_rows, fitting, guarded, joint_bounds, tip_row, yielding
 from rtctl.control.linalg import matvec
 from rtctl.control.model import Model
 from rtctl.control.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
 from rtctl.control.primitives import Obstacles
-from rtctl.control.robot import Robot
+from rtctl.control.robot import JOINTS_MAX, Robot
 from rtctl.types import F64, I64, Cut, Record
 
-SPEED_BAND = 0.9  # fraction of qd_max that the guard lets joints have
-LEAST_SHARE = 0.2  # of tau_max that the field may use however heavy the arm
-SPEED_HORIZON = 0.02  # [s] within which it wants a bound kept: ten times what two periods of delay at 1 kHz bear
 _CAP, _SPEED, _SINGULAR = (int(c) for c in (Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR))
+_SCALED = int(Cut.MOTION_SCALED)
 
 
 class Law(NamedTuple):
@@ -40,7 +39,7 @@ class Law(NamedTuple):
     force: F64  # (K, 3) [N]
     nearest: I64  # (K,) PSP
     rho_self: float  # [m]
-    cut: int  # Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR
+    cut: int  # Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR, Cut.MOTION_SCALED
 
 
 @njit(cache=True, fastmath=False)
@@ -56,75 +55,6 @@ def moved_points(P: F64, Jp: F64, dq: F64) -> F64:
             for k in range(n):
                 X[r, i] += Jp[r, i, k] * dq[k]
     return X
-
-
-@njit(cache=True, fastmath=False)
-def guard(
-    A: F64, A_inv: F64, tau: F64, q: F64, qd: F64, q_min: F64, q_max: F64, qd_max: F64, braking: F64
-) -> tuple[F64, bool]:
-    """Return the torque (n,) [Nm] that keeps every joint's speed where it can still stop, and whether any acts.
-
-    A velocity damper (Faverjon): qdd_i <= (v_i - qd_i)/T with v_i = min(SPEED_BAND qd_max, sqrt(2 braking (q_max - q)))
-    and the same downwards, imposed on qdd = A^-1 tau, `tau` being all torque but gravity and Coriolis. A delta with
-    delta the missing acceleration changes the offending joints alone.
-    """
-    n = qd.shape[0]
-    delta = np.zeros(n)
-    acts = False
-    for i in range(n):
-        qdd = 0.0
-        for k in range(n):
-            qdd += A_inv[i, k] * tau[k]
-        up = min(SPEED_BAND * qd_max[i], np.sqrt(2.0 * braking[i] * max(0.0, q_max[i] - q[i])))
-        down = min(SPEED_BAND * qd_max[i], np.sqrt(2.0 * braking[i] * max(0.0, q[i] - q_min[i])))
-        high, low = (up - qd[i]) / SPEED_HORIZON, (-down - qd[i]) / SPEED_HORIZON
-        if qdd > high or qdd < low:
-            acts = True
-            delta[i] = high - qdd if qdd > high else low - qdd
-    return matvec(A, delta), acts
-
-
-@njit(cache=True, fastmath=False)
-def tip_guard(J: F64, Jdqd: F64, A_inv: F64, tau: F64, xd: F64, v_max: float, floor: float) -> tuple[F64, bool]:
-    """Return the torque (n,) [Nm] that keeps the tip's speed below v_max [m/s], and whether it acts.
-
-    Along u = xd/|xd| the acceleration u^T (J A^-1 tau + Jd qd) may be (v_max - |xd|)/T at most; the excess is taken off
-    by a force along u with the effective mass there, 1/max(u^T J A^-1 J^T u, floor). The motion task never asks for
-    more than v_max; a field that shoves the arm may.
-    """
-    n = tau.shape[0]
-    guard_tau = np.zeros(n)
-    speed = np.sqrt(xd[0] * xd[0] + xd[1] * xd[1] + xd[2] * xd[2])
-    if speed < 0.5 * v_max:
-        return guard_tau, False
-    row = (J[0] * xd[0] + J[1] * xd[1] + J[2] * xd[2]) / speed
-    accel = (Jdqd[0] * xd[0] + Jdqd[1] * xd[1] + Jdqd[2] * xd[2]) / speed
-    mobility = 0.0
-    for i in range(n):
-        for k in range(n):
-            accel += row[i] * A_inv[i, k] * tau[k]
-            mobility += row[i] * A_inv[i, k] * row[k]
-    excess = accel - (v_max - speed) / SPEED_HORIZON
-    if excess <= 0.0:
-        return guard_tau, False
-    for i in range(n):
-        guard_tau[i] = -excess / max(mobility, floor) * row[i]
-    return guard_tau, True
-
-
-@njit(cache=True, fastmath=False)
-def bounded(tau: F64, load: F64, tau_max: F64) -> F64:
-    """Return tau (n,) [Nm] scaled as one to what every joint has left beside its load (n,), at least LEAST_SHARE.
-
-    A field that asks for more than the motors have must lose strength, not direction: clamped joint by joint it would
-    push somewhere else.
-    """
-    scale = 1.0
-    for i in range(tau.shape[0]):
-        room = max(tau_max[i] - abs(load[i]), LEAST_SHARE * tau_max[i])
-        if abs(tau[i]) * scale > room:
-            scale = room / abs(tau[i])
-    return tau * scale
 
 
 @njit(cache=True, fastmath=False)
@@ -172,6 +102,8 @@ def evaluate_law(
 def prepared(robot: Robot) -> Robot:
     """Return the robot with the constants of the law as one record: numba takes one array in a tenth of the time.
 
+    Arrays over joints are padded to JOINTS_MAX: one layout, whatever the arm. numba names compiled code by a number
+    that it gives each record type in each process, so that of two layouts from its cache one would run as the other.
     Whoever replaces a gain or bound of a robot prepares it anew.
     """
     groups: dict[str, Any] = {
@@ -181,20 +113,23 @@ def prepared(robot: Robot) -> Robot:
         "limit": robot.limit,
     }
     values = {f"{group}_{k}": v for group, params in groups.items() for k, v in params._asdict().items()}
-    values |= {k: getattr(robot, k) for k in ("q_min", "q_max", "qd_max", "tau_max", "braking", "dt")}
-    constants = np.zeros(1, [(k, np.float64, np.shape(v)) for k, v in values.items()])
+    values |= {k: getattr(robot, k) for k in ("q_min", "q_max", "qd_max", "tau_max", "tau_rate", "braking", "dt")}
+    constants = np.zeros(1, [(k, np.float64, (JOINTS_MAX,) * np.ndim(v)) for k, v in values.items()])
     for k, v in values.items():
-        constants[k] = v
+        if np.ndim(v):
+            constants[k][0, : robot.n] = v
+        else:
+            constants[k] = v
     return robot._replace(constants=constants)
 
 
 @njit(cache=True, fastmath=False)
-def _params(c: Any) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
+def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
     """Return the parameters that `prepared` put into the record c."""
     return (
         MotionParams(
             c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max,
-            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture.copy(), c.motion_epsilon, c.motion_length,
+            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture[:n].copy(), c.motion_epsilon, c.motion_length,
             c.motion_speed_margin,
         ),
         FieldParams(
@@ -206,7 +141,8 @@ def _params(c: Any) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams
             c.own_m_max,
         ),
         LimitParams(
-            c.limit_rho0.copy(), c.limit_rho_min.copy(), c.limit_rho_num.copy(), c.limit_eta.copy(), c.limit_k_d.copy()
+            c.limit_rho0[:n].copy(), c.limit_rho_min[:n].copy(), c.limit_rho_num[:n].copy(), c.limit_eta[:n].copy(),
+            c.limit_k_d[:n].copy(),
         ),
     )  # fmt: skip
 
@@ -221,10 +157,10 @@ def _evaluate(
 
     One compiled call with few results: crossing the border costs as much as a term, and a tenth of that per array.
     """
-    c = constants[0]
-    p, avoid, self_avoid, limit = _params(c)
-    q_min, q_max, tau_max, braking = c.q_min.copy(), c.q_max.copy(), c.tau_max.copy(), c.braking.copy()
-    qd_max, dt = pace * c.qd_max.copy(), c.dt
+    c, n = constants[0], q.shape[0]
+    p, avoid, self_avoid, limit = _params(c, n)
+    q_min, q_max, tau_max, braking = c.q_min[:n].copy(), c.q_max[:n].copy(), c.tau_max[:n].copy(), c.braking[:n].copy()
+    tau_rate, qd_max, dt = c.tau_rate[:n].copy(), pace * c.qd_max[:n], c.dt
     qd_free = qd - matvec(space.Jbar, np.concatenate((xd, omega)))
     v, w = velocity_reference(
         e, e_rot, v_ref, w_ref, space.Jbar, qd_free, qd_max, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max,
@@ -241,19 +177,29 @@ def _evaluate(
     tau_limits = np.empty(q.shape[0])
     joint_limit_field(q, qd, q_min, q_max, diagonal(model.A), limit, tau_limits)
     load = model.g + model.h
-    tau_obstacles = bounded(seen.tau + tau_own, load, tau_max)
-    tau_limits = bounded(tau_limits, load, tau_max)
+    tau_obstacles = seen.tau + tau_own
+    tau_obstacles *= fitting(tau_obstacles, load, tau_max)
+    tau_limits *= fitting(tau_limits, load, tau_max)
     drive, keep = tau_drive + tau_rest, tau_brake + tau_damp + tau_obstacles + tau_limits
-    tau_tip, hasty = tip_guard(model.J, model.Jdqd, model.A_inv, drive + keep, xd, p.v_max, p.epsilon)
-    keep = keep + bounded(tau_tip, load, tau_max)
-    tau_guard, fast = guard(model.A, model.A_inv, drive + keep, q, qd, q_min, q_max, qd_max, braking)
-    tau_guard = bounded(tau_guard, load, tau_max)
+    share = yielding(drive, load + keep, tau_max)  # before the guards: they judge what will be sent
+    drive = share * drive
+    low, high = joint_bounds(model.A, q, qd, q_min, q_max, qd_max, braking, tau_rate)
+    near, near_bounds = approach_rows(
+        seen.leader, link, seen.pairs, model.Jp, model.own_rho, model.own_row, dq, model.A_inv, qd, avoid.rho0,
+        self_avoid.rho0, p.a_max, tau_rate,
+    )  # fmt: skip
+    rows, bounds = np.empty((near.shape[0] + 1, q.shape[0])), np.empty(near.shape[0] + 1)
+    rows[0], bounds[0] = tip_row(model.J, model.Jdqd, model.A_inv, xd, p.v_max, tau_rate)
+    rows[1:], bounds[1:] = near, near_bounds
+    net, guards = guarded(model.A, model.A_inv, drive + keep, load, tau_max, low, high, rows, bounds)
+    tau_guard = net - drive - keep
     cut = _CAP if (flags | own_flags) & CAPPED else 0
-    cut |= _SPEED if fast or hasty else 0
+    cut |= _SPEED if guards else 0
     cut |= _SINGULAR if space.damped else 0
+    cut |= _SCALED if share < 1.0 else 0
     torques = np.empty((6, q.shape[0]))
-    torques[0], torques[1] = tau_drive + tau_brake, tau_rest + tau_damp
-    torques[2], torques[3] = tau_obstacles, tau_limits + tau_tip + tau_guard
+    torques[0], torques[1] = share * tau_drive + tau_brake, share * tau_rest + tau_damp
+    torques[2], torques[3] = tau_obstacles, tau_limits + tau_guard
     torques[4], torques[5] = drive, load + keep + tau_guard
     task = np.concatenate((F, v, w))
     return task, torques, seen.rho_min.copy(), seen.force.copy(), seen.nearest.copy(), rho_own, cut

@@ -48,6 +48,15 @@ def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt
 
 
 @njit(cache=True, fastmath=False)
+def pulled(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
+    """Return whether `slew_reference` left what was sent by more than the rounding of an echo [Nm] on any joint."""
+    for i in range(reference.shape[0]):
+        if abs(reference[i] - tau_sent[i]) > tau_lsb[i]:
+            return True
+    return False
+
+
+@njit(cache=True, fastmath=False)
 def _permit(
     drive: F64, keep: F64, qd: F64, reference: F64, tau_max: F64, tau_rate: F64, D: F64, dt: float
 ) -> tuple[F64, F64, int, float]:

@@ -6,6 +6,7 @@ from rtctl.control.estimator import JointEstimate, TipEstimate
 from rtctl.control.faults import Counters
 from rtctl.control.model import Model
 from rtctl.control.osc import OperationalSpace
+from rtctl.control.watch import Watch
 from rtctl.control.world import World
 from rtctl.types import F64, I64, Goal, Severity, State, Status, Task
 
@@ -35,11 +36,13 @@ class Memory(NamedTuple):
     model: Model
     space: OperationalSpace
     task: Task  # that `space` was evaluated for
+    axis: F64  # (3,) of the tool that goes with it
     evaluated: bool  # the model, this tick
     phase: float  # model periods since the last evaluation was due, in (-1, 0]
     qdd: F64  # (n,) [rad/s2] predicted from the torque of the last command
     q_previous: F64  # (n,) [rad] of the last feedback
     age_previous: F64  # (n,) [s] how old it was
+    watch: Watch  # on the encoders
     rest: int  # ticks all joints have been at rest
     # task
     goal: Goal | None
@@ -56,4 +59,5 @@ class Memory(NamedTuple):
     rho: F64  # (K,) [m] from the arm to each obstacle
     sent: F64  # (4, n) [Nm] the last commands, newest first
     cut: int  # types.Cut of the last tick
+    pulled: bool  # the last reference for the slew was taken from the echo: the drive does not give what it is sent
     pace: float  # fraction of qd_max that joints may have

@@ -60,25 +60,26 @@ def damped_reciprocal(s: float, epsilon: float) -> float:
 
 @njit(cache=True, fastmath=False)
 def _operational_space(
-    J: F64, A_inv: F64, Lambda_inv: F64, m: int, epsilon: float, length: float
+    J: F64, A_inv: F64, Lambda_inv: F64, S: F64, epsilon: float, length: float
 ) -> tuple[F64, F64, F64, float, bool]:
-    n = J.shape[1]
+    n, m = J.shape[1], S.shape[0]
     scale = np.ones(6)
     for i in range(3, 6):
         scale[i] = length
-    S = np.empty((m, m))
-    for i in range(m):
-        for j in range(m):
-            S[i, j] = scale[i] * Lambda_inv[i, j] * scale[j]
-    values, V = symmetric_eigen(S)
-    sigma_min = values[0]
+    G = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            G[i, j] = scale[i] * Lambda_inv[i, j] * scale[j]
+    values, V = symmetric_eigen(matmul(S, matmul(G, S.T.copy())))  # unit rows of S pick exactly
+    W = matmul(S.T.copy(), V)  # (6, m) eigenvectors in world axes
+    sigma_min = np.inf
     Lambda = np.zeros((6, 6))
     for k in range(m):
         sigma_min = min(sigma_min, values[k])
         f = damped_reciprocal(values[k], epsilon)
-        for i in range(m):
-            for j in range(m):
-                Lambda[i, j] += scale[i] * V[i, k] * f * V[j, k] * scale[j]
+        for i in range(6):
+            for j in range(6):
+                Lambda[i, j] += scale[i] * W[i, k] * f * W[j, k] * scale[j]
     Jbar = matmul(A_inv, matmul(J.T.copy(), Lambda))
     NT = np.zeros((n, n))
     for i in range(n):
@@ -89,13 +90,14 @@ def _operational_space(
     return Lambda, Jbar, NT, sigma_min, sigma_min < epsilon
 
 
-def operational_space(J: F64, A_inv: F64, Lambda_inv: F64, task_rows: int, p: MotionParams) -> OperationalSpace:
-    """Return Lambda = (J A^-1 J^T)^-1 with its spectrum damped below `p.epsilon`, and what follows from it.
+def operational_space(J: F64, A_inv: F64, Lambda_inv: F64, S: F64, p: MotionParams) -> OperationalSpace:
+    """Return Lambda = S^T (S J A^-1 J^T S^T)^-1 S with its spectrum damped below `p.epsilon`, and what follows from it.
 
-    J (6, n) tip Jacobian, A_inv (n, n) [1/(kg m2)], Lambda_inv (6, 6) = J A^-1 J^T, task_rows 3 (position) or 6 (pose).
-    Damping acts on the eigenvalues, so the well-conditioned directions keep their exact inertia.
+    J (6, n) tip Jacobian, A_inv (n, n) [1/(kg m2)], Lambda_inv (6, 6) = J A^-1 J^T, S (k, 6) orthonormal rows of
+    `task.selection` that do not mix linear with angular axes. What S leaves out belongs to the null space. Damping acts
+    on the eigenvalues, so the well-conditioned directions keep their exact inertia.
     """
-    return OperationalSpace(*_operational_space(J, A_inv, Lambda_inv, task_rows, p.epsilon, p.length))
+    return OperationalSpace(*_operational_space(J, A_inv, Lambda_inv, S, p.epsilon, p.length))
 
 
 @njit(cache=True, fastmath=False)

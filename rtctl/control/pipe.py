@@ -6,12 +6,12 @@ block diagram is `tick`; each block is a function below it or a module beside it
 
 import numpy as np
 
-from rtctl.control import goals, primitives, scan, world
-from rtctl.control.estimator import joint_start, joint_step, start, tip_step, update_pose
+from rtctl.control import goals, primitives, scan, watch, world
+from rtctl.control.estimator import held, joint_start, joint_step, start, tip_step, update_pose
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
 from rtctl.control.law import Law, evaluate_law
-from rtctl.control.limits import Permitted, permit, slew_reference
+from rtctl.control.limits import Permitted, permit, pulled, slew_reference
 from rtctl.control.linalg import matvec
 from rtctl.control.memory import Memory
 from rtctl.control.model import Model
@@ -20,6 +20,7 @@ from rtctl.control.record import make_record
 from rtctl.control.robot import Robot
 from rtctl.control.session import (
     REST_HOLD,
+    believed,
     detected,
     drives_torque,
     held_here,
@@ -27,8 +28,11 @@ from rtctl.control.session import (
     supervised,
     with_goal,
 )
-from rtctl.control.so3 import error_to, quat_of
+from rtctl.control.so3 import quat_of
+from rtctl.control.task import error_of, lost_of, point_of, selected, selection, task_error
 from rtctl.types import (
+    F64,
+    TOOL_Z,
     Command,
     Drive,
     Feedback,
@@ -48,6 +52,7 @@ BRAKING = (State.STOPPING, State.SAFE_STOP)
 ZERO = np.zeros(3)
 START_PACE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
+LOST = 0.5  # share of the error in lost directions from which an arm at rest is held by its singularity
 MISSED_MAX = 10  # slots that estimates coast through; more is a fault
 
 
@@ -58,9 +63,10 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     """
     m = memory._replace(tick=memory.tick + 1, verdict="")
     elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
-    m = _estimated(robot, m, feedback, elapsed)
+    credible, jumped = believed(robot, m, feedback)
+    m = _estimated(robot, m, credible, elapsed)
     m = _perceived(robot, m, request, elapsed)
-    m, present = detected(robot, m, feedback)
+    m, present = detected(robot, m, credible, jumped)
     m = supervised(robot, m, feedback, request, present)
     m = with_goal(robot, m, request)
     m, law = _law(robot, m)
@@ -74,23 +80,25 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     q, zero = feedback.q.copy(), np.zeros(robot.n)
     model = robot.body.evaluate(q, zero, robot.points, robot.own)
     joints, tip = joint_start(q, robot.joint_P), start(model.x, model.R, robot.tip_design)
-    table = world.with_static(world.empty(robot.slots), robot.obstacles)
-    space = _space(robot, Task.POSE, model)
+    table = world.empty(robot.slots, robot.meshes, robot.safety.creep, robot.safety.feed_timeout)
+    table = world.with_static(table, robot.obstacles)
+    space = _space(robot, robot.axes, TOOL_Z, model)
     far = np.full(robot.slots, np.inf)
     return Memory(
         tick=-1, state=State.IDLE, since=-1, reaction=Severity.NONE, off=False, in_force=0,
         good=np.full(len(FAULTS), 1 << 30), counters=Counters(), clear_until=-1, recovering=False, outside=False,
         leaving=False, done=False, verdict="", joints=joints, tip=tip, innovation=0.0, model=model, space=space,
-        task=Task.POSE, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero, rest=0,
-        goal=None, hold=hold_at(model.x, model.R),
+        task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero,
+        watch=watch.fresh(robot.n), rest=0,
+        goal=None, hold=hold_at(model.x, model.R, robot.axes),
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
-        rho=far, sent=np.zeros((4, robot.n)), cut=0, pace=START_PACE,
+        rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,
     )  # fmt: skip
 
 
-def _space(robot: Robot, task: Task, model: Model) -> OperationalSpace:
-    rows = 3 if task == Task.POSITION else 6
-    return operational_space(model.J, model.A_inv, model.Lambda_inv, rows, robot.motion)
+def _space(robot: Robot, task: Task, axis: F64, model: Model) -> OperationalSpace:
+    S = selection(int(task), axis, model.R)
+    return operational_space(model.J, model.A_inv, model.Lambda_inv, S, robot.motion)
 
 
 def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> Memory:
@@ -99,18 +107,23 @@ def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> M
         m.joints, m.qdd, feedback.q, feedback.qd, feedback.age, feedback.replies > 0, elapsed, robot.joint_filter
     )
     phase = m.phase + robot.dt / robot.model_dt
-    task = m.goal.task if m.goal is not None else m.hold.task
+    target = m.goal if m.goal is not None else m.hold
+    task, axis = target.task, target.axis
+    changed = task != m.task or (axis is not m.axis and bool((axis != m.axis).any()))
     due = phase > 0.0
     model = robot.body.evaluate(joints.q, joints.qd, robot.points, robot.own) if due else m.model
-    space = _space(robot, task, model) if due or task != m.task else m.space
+    space = _space(robot, task, axis, model) if due or changed else m.space
     tip, innovation = tip_step(m.tip, m.model.J, m.model.Jdqd, m.qdd, model.J, joints.qd, elapsed, robot.estimator)
     innovation = max(innovation, scan.largest(surprise))
-    if due:  # evaluated at the state of this slot: its age is zero
+    if not robot.carry:
+        tip = held(tip, model.x, model.R, model.J, joints.qd) if due else m.tip
+        model, innovation = model._replace(q=joints.q), scan.largest(surprise)  # the points have not moved either
+    elif due:  # evaluated at the state of this slot: its age is zero
         tip, other = update_pose(tip, model.x, model.R, 0.0, robot.estimator)
         innovation = max(innovation, other)
     return m._replace(
         joints=joints, tip=tip, innovation=innovation, model=model, space=space, task=task,
-        evaluated=due, phase=phase - 1.0 if due else phase,
+        axis=axis, evaluated=due, phase=phase - 1.0 if due else phase,
     )  # fmt: skip
 
 
@@ -119,7 +132,7 @@ def _perceived(robot: Robot, m: Memory, request: Request, elapsed: float) -> Mem
     table, verdict = world.advanced(m.world, elapsed), m.verdict
     if request.obstacles:
         table, verdict = world.edited(table, request.obstacles)
-    rho = m.goal_rho if m.goal is None else world.distance_from(table, m.goal.position)
+    rho = m.goal_rho if m.goal is None else world.distance_from(table, point_of(m.goal, m.tip.x))
     return m._replace(world=table, verdict=verdict, goal_rho=rho)
 
 
@@ -130,16 +143,20 @@ def _law(robot: Robot, m: Memory) -> tuple[Memory, Law]:
     m = m._replace(pace=_pace(robot, m))
     slow = braking and max(np.abs(m.v_ref).max(), np.abs(m.w_ref).max()) < 1e-3
     if braking and not slow:
-        m = held_here(m)  # the hold begins where the braking ends
+        m = held_here(robot, m)  # the hold begins where the braking ends
     target = m.goal if pursuing and m.goal is not None else m.hold
     hasten = not braking or slow  # while braking the references only fall to zero
-    e = target.position - m.tip.x if hasten else ZERO
-    e_rot = error_to(m.tip.R, target.wxyz) if m.task == Task.POSE and hasten else ZERO
+    e, e_rot = ZERO, ZERO
+    if hasten:
+        e, e_rot = task_error(int(target.task), target.axis, target.position, target.wxyz, m.tip.x, m.tip.R)
+        if target.task != m.task:  # a goal of this tick: `space` is still that of the one before
+            e, e_rot = selected(int(m.task), m.axis, m.tip.R, e, e_rot)
     law = evaluate_law(
         robot, m.model, m.space, m.world.obstacles, m.joints.q, m.joints.qd, m.tip.xd, m.tip.omega, e, e_rot,
         m.v_ref, m.w_ref, robot.q_rest if pursuing else m.q_rest, m.pace,
     )  # fmt: skip
-    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=law.rho), law
+    seen = law.rho + m.world.obstacles.margin  # where it is, not where it might be: no contact by growing old
+    return m._replace(v_ref=law.v_ref, w_ref=law.w_ref, rho=seen), law
 
 
 def _pace(robot: Robot, m: Memory) -> float:
@@ -157,6 +174,7 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
         drive, keep = np.zeros(robot.n), m.model.g - robot.stop.damping * m.joints.qd * fresh
     lag = max(1, round(scan.largest(feedback.age) / robot.dt))
     reference = slew_reference(m.sent[0], feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, lag)
+    off = pulled(reference, m.sent[0], robot.tau_lsb)
     permitted = permit(drive, keep, m.joints.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt)
     command = Command(_asked_of_drives(m, feedback), permitted.tau)
     if command.drive != Drive.TORQUE:
@@ -164,7 +182,7 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
     moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
     qdd = matvec(m.model.A_inv, command.tau - m.model.h - m.model.g) if moving else np.zeros(robot.n)
     sent = scan.pushed(command.tau, m.sent)
-    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut), command, permitted
+    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut, pulled=off), command, permitted
 
 
 def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
@@ -190,19 +208,20 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Memor
 
 def _progress(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Progress:
     assert m.goal is not None
-    pose = m.goal.task == Task.POSE
+    error, error_rot = error_of(m.goal, m.tip.x, m.tip.R)
+    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
     return Progress(
-        error=scan.norm(m.goal.position - m.tip.x),
-        error_rot=scan.norm(error_to(m.tip.R, m.goal.wxyz)) if pose else 0.0,
-        speed=scan.norm(m.tip.xd),
-        rate=scan.norm(m.tip.omega) if pose else 0.0,
+        error=error,
+        error_rot=error_rot,
+        speed=scan.norm(v),
+        rate=scan.norm(w),
         goal_rho=m.goal_rho,
         rho=law.rho,
         force=scan.norms(law.force),
         tau_limits=law.tau_limits,
         tau_max=robot.tau_max,
         tau_wanted=permitted.tau_wanted,
-        damped=m.space.damped,
+        damped=m.space.damped and lost_of(m.goal, m.model.Lambda_inv, m.space.Lambda, m.tip.x, m.tip.R)[2] > LOST,
         cut=m.cut,
         rho0=robot.avoid.rho0,
     )
@@ -213,20 +232,26 @@ def _record(
 ) -> Record:
     """Write everything that came in and went out into one struct."""
     goal = m.goal if m.goal is not None else m.hold
+    error, error_rot = error_of(goal, m.tip.x, m.tip.R)
     return make_record(
         robot.n, robot.slots,
         tick=m.tick, slot=feedback.slot, time=feedback.slot * robot.dt, missed=feedback.missed, link=feedback.link,
         q=feedback.q, qd=feedback.qd, tau_measured=feedback.tau, age=feedback.age, replies=feedback.replies,
         drive=feedback.drive, verb=request.verb, lateness=feedback.lateness, compute=feedback.compute,
         x=m.tip.x, xd=m.tip.xd, wxyz=quat_of(m.tip.R), omega=m.tip.omega, innovation=m.innovation,
-        goal=goal.position, goal_wxyz=goal.wxyz, task=m.task, F=law.F, error=scan.norm(goal.position - m.tip.x),
-        error_rot=scan.norm(error_to(m.tip.R, goal.wxyz)) if m.task == Task.POSE else 0.0,
-        sigma_min=m.space.sigma_min, rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
+        goal=goal.position, goal_wxyz=goal.wxyz, goal_axis=goal.axis, task=goal.task, F=law.F,
+        error=error, error_rot=error_rot, sigma_min=m.space.sigma_min,
+        rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
         tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
         tau_gravity=m.model.g + m.model.h, tau_wanted=permitted.tau_wanted, tau_sent=command.tau,
         command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, severity=m.reaction,
         faults=m.in_force, model_evaluated=m.evaluated,
     )  # fmt: skip
+
+
+def _meshes_at(robot: Robot, position: np.ndarray, wxyz: np.ndarray) -> list[Shape]:
+    names, zero = robot.meshes.names[:1], np.zeros(4)
+    return [Shape("mesh", "mesh", zero, position, wxyz, zero[:3], zero[:3], mesh=name) for name in names]
 
 
 def warm(robot: Robot) -> None:
@@ -252,8 +277,11 @@ def warm(robot: Robot) -> None:
     edits = tuple(
         ObstacleEdit(kind, Shape(kind, kind, np.array([0.1, 0.1, 0.1, 2.0]), far, wxyz, np.ones(3), np.ones(3)))
         for kind in primitives.TYPES
+        if kind not in ("mesh", "cloud")
     )
-    for task in Task:
+    many = Shape("cloud", "cloud", np.array([0.1, 1e-3, 0.0, 0.0]), far, wxyz, np.ones(3), np.ones(3), cloud=bytes(600))
+    edits += tuple(ObstacleEdit(s.name, s) for s in (many, *_meshes_at(robot, far, wxyz)))
+    for task in (Task.POSE, Task.POSITION | Task.DIRECTION):
         goal = Goal(m.tip.x, quat_of(m.tip.R), task, 1e-3, 1e-2)
         moving = m._replace(state=State.RUN, goal=goal, in_force=0)
         beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))

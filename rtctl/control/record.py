@@ -45,9 +45,10 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
             ("innovation", f),  # normalised, of the estimator
             ("goal", f, (3,)),
             ("goal_wxyz", f, (4,)),
+            ("goal_axis", f, (3,)),  # of the tool, for a direction
             ("task", "<u4"),  # types.Task
             ("F", f, (6,)),  # F*_m of the motion task, acceleration [m/s2, rad/s2]
-            ("error", f),  # [m] to the goal
+            ("error", f),  # [m] to the goal, along the axes of the task
             ("error_rot", f),  # [rad] to the goal
             ("sigma_min", f),  # smallest eigenvalue of J A^-1 J^T
             # obstacles by slot

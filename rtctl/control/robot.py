@@ -7,12 +7,14 @@ import numpy as np
 from rtctl.control.estimator import Design, EstimatorParams, JointParams
 from rtctl.control.faults import SafetyParams
 from rtctl.control.field import Field, FieldParams, LimitParams
+from rtctl.control.meshes import NONE, Meshes
 from rtctl.control.model import RigidBody
 from rtctl.control.osc import MotionParams
 from rtctl.control.own import Own
 from rtctl.control.points import Coverage, Points
-from rtctl.types import F64, Record, Shape
+from rtctl.types import F64, Record, Shape, Task
 
+JOINTS_MAX = 15  # of any arm: motor ids have four bits
 SLOTS = 64  # obstacle slots: the size of every array over obstacles
 
 
@@ -64,4 +66,7 @@ class Robot(NamedTuple):
     scratch: Field  # work arrays of the field, overwritten every tick
     tolerance: float  # [m] of a goal that gives none
     tolerance_rot: float  # [rad]
+    axes: Task = Task.POSE  # of the tip that the arm can move
+    meshes: Meshes = NONE  # that obstacles may refer to
+    carry: bool = True  # tip and points are estimated between evaluations; else held still
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`

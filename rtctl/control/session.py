@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from rtctl.control import faults, goals, scan, supervisor, world
+from rtctl.control import faults, goals, scan, supervisor, task, watch, world
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import quat_of
 from rtctl.control.supervisor import Event
-from rtctl.types import Cut, Feedback, Goal, Request, Severity, State, Status, Task, Verb
+from rtctl.types import F64, Cut, Feedback, Goal, Request, Severity, State, Status, Task, Verb
 
 SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque builds up at its rate limit
 ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
@@ -37,15 +37,50 @@ def drives_torque(m: Memory) -> bool:
     return m.state in (State.ARMED, State.RUN, State.STOPPING)
 
 
-def detected(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Memory, int]:
-    """Return the memory with the faults in force, and the bits of those present now."""
+def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, bool]:
+    """Return the feedback with silence in place of positions that no joint can have reached, and whether any is.
+
+    A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump.
+    """
+    if not drives_torque(m) or m.state == State.ARMED:
+        return feedback, False
+    elapsed = robot.dt * (1 + feedback.missed)
+    odd = faults.jumped(
+        feedback.q, feedback.age, feedback.replies, m.q_previous, m.age_previous, robot.qd_max, elapsed, robot.dt
+    )
+    if not scan.any_set(odd):
+        return feedback, False
+    silent = np.minimum(m.age_previous + elapsed, robot.safety.lost_periods * robot.dt)
+    return feedback._replace(
+        q=np.where(odd, m.q_previous, feedback.q),
+        age=np.where(odd, silent, feedback.age),
+        replies=np.where(odd, 0, feedback.replies),
+    ), True
+
+
+def _watched(robot: Robot, m: Memory, feedback: Feedback) -> tuple[watch.Watch, bool, bool]:
+    f, safety = feedback, robot.safety
+    elapsed = robot.dt * (1 + f.missed)
+    return watch.watched(
+        m.watch, f.q, f.qd, f.age, f.replies, m.q_previous, m.age_previous, m.qdd, m.model.A, safety.friction,
+        safety.velocity_tolerance, elapsed, robot.dt,
+    )  # fmt: skip
+
+
+def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple[Memory, int]:
+    """Return the memory with the faults in force, and the bits of those present now; what jumped is in no feedback."""
     low, high = scan.span(m.sent)
+    active = drives_torque(m) and m.state != State.ARMED
+    seen, stuck, disagree = _watched(robot, m, feedback) if active else (watch.fresh(robot.n), False, False)
     evidence = Evidence(
-        active=drives_torque(m) and m.state != State.ARMED,
+        active=active,
+        powered=drives_torque(m),
         torque_low=low,
         torque_high=high,
-        q_previous=m.q_previous,
-        age_previous=m.age_previous,
+        jumped=jumped,
+        stuck=stuck,
+        disagree=disagree,
+        pulled=m.pulled,
         armed_outside=m.recovering,
         not_finite=bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation),
         contact=scan.any_below(m.rho, 0.0),
@@ -66,6 +101,7 @@ def detected(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Memory, int]:
         age_previous=feedback.age,
         outside=outside,
         recovering=m.recovering and outside,
+        watch=seen,
         rest=0 if scan.any_faster(feedback.qd, REST_SPEED) else m.rest + 1,
     )
     return m, present
@@ -82,7 +118,7 @@ def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, pr
     if state in (State.SAFE_STOP, State.FAULT):
         m = m._replace(reaction=max(m.reaction, worst, Severity.SS2 if event == Event.STOP else Severity.NONE))
     if state != m.state:
-        m = _entered(m, state)
+        m = _entered(robot, m, state)
     if event == Event.ARM:
         m = m._replace(recovering=m.outside)
     at_rest = m.state in (State.IDLE, State.FAULT) or (m.state == State.SAFE_STOP and m.off)
@@ -136,24 +172,24 @@ def _timed(robot: Robot, m: Memory, enabled: bool) -> set[Event]:
     return set()
 
 
-def _entered(m: Memory, state: State) -> Memory:
+def _entered(robot: Robot, m: Memory, state: State) -> Memory:
     """Return the memory on entering a state: every motion begins from what is measured now."""
     m = m._replace(state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False)
     if state in (State.ARMED, State.RUN):
         m = m._replace(v_ref=np.zeros(3), w_ref=np.zeros(3))
     if state not in (State.SAFE_STOP, State.FAULT):
         m = m._replace(reaction=Severity.NONE)
-    return held_here(m)
+    return held_here(robot, m)
 
 
-def held_here(m: Memory) -> Memory:
+def held_here(robot: Robot, m: Memory) -> Memory:
     """Return the memory with the pose and posture of now as those to hold."""
-    return m._replace(hold=hold_at(m.tip.x, m.tip.R), q_rest=m.joints.q)
+    return m._replace(hold=hold_at(m.tip.x, m.tip.R, robot.axes), q_rest=m.joints.q)
 
 
-def hold_at(x: np.ndarray, R: np.ndarray) -> Goal:
-    """Return the goal of staying at x (3,) [m] with orientation R (3, 3)."""
-    return Goal(x.copy(), quat_of(R), Task.POSE, 0.0, 0.0)
+def hold_at(x: F64, R: F64, axes: Task) -> Goal:
+    """Return the goal of staying at x (3,) [m] with orientation R (3, 3), along the axes that the arm can move."""
+    return Goal(x.copy(), quat_of(R), axes, 0.0, 0.0)
 
 
 def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
@@ -166,8 +202,11 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         verdict = f"goal: not possible in state {m.state.name}"
     elif m.outside:
         verdict = "goal: a joint is still beyond its limits"
-    rho = world.distance_from(m.world, goal.position)
-    verdict = verdict or goals.refusal(goal, robot.base, robot.reach, rho, m.world.names)
+    wanted, why = task.within(goal.task, robot.axes)
+    goal = goal._replace(task=wanted)
+    rho = world.distance_from(m.world, task.point_of(goal, m.tip.x))
+    near = goal._replace(position=task.point_of(goal, robot.base))  # what is free is no further than it need be
+    verdict = verdict or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
     if verdict:
         return m._replace(verdict=verdict)
     return m._replace(goal=goal, goal_rho=rho, status=Status.MOVING, blocker=-1, still=0)

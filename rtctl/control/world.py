@@ -6,8 +6,19 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rtctl.control import scan
-from rtctl.control.primitives import Obstacles, advance, distances_into, fault_of, obstacles_empty, with_shape, without
+from rtctl.control import meshes, scan
+from rtctl.control.meshes import Meshes
+from rtctl.control.primitives import (
+    CLOUDS,
+    Obstacles,
+    advance,
+    cloud_place,
+    distances_into,
+    fault_of,
+    obstacles_empty,
+    with_shape,
+    without,
+)
 from rtctl.types import B1, F64, ObstacleEdit, Shape
 
 SLOTS = 64
@@ -15,26 +26,35 @@ AGE_MAX = 3600.0  # [s] of an observation; NaN and times to come are none
 
 
 class World(NamedTuple):
-    """Obstacle slots; a name is '' where the slot is free."""
+    """Obstacle slots; a name is '' where the slot is free.
+
+    What was observed `age` ago may have come nearer by creep * age in a way its velocity does not tell: the surface is
+    taken to be nearer by that. Past `stale` the arm stops, and the margin stops growing: it never fills the world.
+    """
 
     obstacles: Obstacles
     names: tuple[str, ...]  # (K,)
     age: F64  # (K,) [s] since the obstacle was last observed
-    moving: B1  # (K,) its observation grows stale
+    moving: B1  # (K,) its observation grows stale: it moves, or somebody keeps observing it
     fixed: B1  # (K,) of the config: nobody clears or replaces it
+    unions: tuple[str, ...]  # (K,) the union that each is a part of, '' for none
+    known: Meshes
+    creep: float  # [m/s] speed that obstacles may have beside the one that is told
+    stale: float  # [s] age at which an observation is too old
 
 
-def empty(slots: int = SLOTS) -> World:
-    """Return a table without obstacles."""
-    no = np.zeros(slots, np.bool_)
-    return World(obstacles_empty(slots), ("",) * slots, np.zeros(slots), no, no)
+def empty(slots: int = SLOTS, known: Meshes = meshes.NONE, creep: float = 0.0, stale: float = 0.5) -> World:
+    """Return a table without obstacles; `known` are the meshes that obstacles may refer to."""
+    no, none = np.zeros(slots, np.bool_), ("",) * slots
+    return World(obstacles_empty(slots, known), none, np.zeros(slots), no, no, none, known, creep, stale)
 
 
 def with_static(world: World, shapes: tuple[Shape, ...]) -> World:
     """Return the table with the config's own obstacles, which never grow stale."""
     world, refusal = edited(world, tuple(ObstacleEdit(s.name, s) for s in shapes))
     assert not refusal, refusal  # config bounds their number
-    return world._replace(moving=np.zeros_like(world.moving), fixed=np.array([bool(name) for name in world.names]))
+    fixed = np.array([bool(name) for name in world.names])
+    return _with_margins(world._replace(moving=np.zeros_like(world.moving), fixed=fixed))
 
 
 def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
@@ -58,7 +78,9 @@ def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
         if slot < 0:
             refusal = f"obstacle {edit.name}: all {len(world.names)} slots are taken"
             continue
-        fault = fault_of(edit.shape)
+        fault = fault_of(edit.shape, world.known)
+        if not fault and edit.shape.type == "cloud" and cloud_place(world.obstacles, slot) < 0:
+            fault = f"there are {CLOUDS} clouds already"
         if not 0.0 <= edit.age <= AGE_MAX:
             fault = f"age: got {edit.age} s, wanted 0 to {AGE_MAX:g}"
         if fault:
@@ -73,28 +95,50 @@ def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
     age, moving = world.age.copy(), world.moving.copy()
     age[slot] = edit.age
     shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
-    moving[slot] = bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
-    names = (*world.names[:slot], edit.name, *world.names[slot + 1 :])
-    return world._replace(obstacles=with_shape(world.obstacles, slot, shape), names=names, age=age, moving=moving)
+    moving[slot] = edit.feed or bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
+    obstacles = with_shape(world.obstacles, slot, shape, known=world.known)
+    world = world._replace(obstacles=obstacles, names=_at(world.names, slot, edit.name), age=age, moving=moving)
+    return _with_margins(_joined(world, slot, shape.group))
+
+
+def _at(texts: tuple[str, ...], slot: int, text: str) -> tuple[str, ...]:
+    return (*texts[:slot], text, *texts[slot + 1 :])
+
+
+def _joined(world: World, slot: int, union: str) -> World:
+    """Return the table with the slot in a union, '' for none: each part carries the number of the union's first."""
+    if not union and not any(world.unions):
+        return world
+    unions = _at(world.unions, slot, union)
+    group = np.array([unions.index(name) if name else k for k, name in enumerate(unions)])
+    return world._replace(unions=unions, obstacles=world.obstacles._replace(group=group))
 
 
 def _without(world: World, slot: int) -> World:
-    names = (*world.names[:slot], "", *world.names[slot + 1 :])
     moving = world.moving.copy()
     moving[slot] = False
-    return world._replace(obstacles=without(world.obstacles, slot), names=names, moving=moving)
+    world = world._replace(obstacles=without(world.obstacles, slot), names=_at(world.names, slot, ""), moving=moving)
+    return _joined(world, slot, "")
+
+
+def _with_margins(world: World) -> World:
+    margin = world.creep * np.minimum(world.age, world.stale) * world.moving
+    return world._replace(obstacles=world.obstacles._replace(margin=margin))
 
 
 def advanced(world: World, dt: float) -> World:
     """Return the table dt [s] later: poses extrapolated, observations older."""
     if not scan.any_set(world.moving):
         return world
-    return world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving)
+    return _with_margins(world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving))
 
 
 def distance_from(world: World, x: F64) -> F64:
-    """Return the distance (K,) [m] of a point x (3,) to each obstacle, negative inside, inf for free slots."""
-    return _distance_from(x, world.obstacles)
+    """Return the distance (K,) [m] of a point x (3,) to each obstacle, negative inside, inf for free slots.
+
+    To where it was seen to be and moves, without the margin of its age.
+    """
+    return _distance_from(x, world.obstacles) + world.obstacles.margin
 
 
 @njit(cache=True, fastmath=False)

@@ -17,6 +17,7 @@ from rtctl.types import F64, I64, Command, Drive, Feedback, Link, Transport
 MIT, MIT_E2E = "mit", "mit+e2e"
 _SPECIAL = {Drive.DISABLE: mit.DISABLE, Drive.ENABLE: mit.ENABLE, Drive.CLEAR: mit.CLEAR}
 _DUPLICATE, _DISORDER, _DOWN = int(Link.DUPLICATE), int(Link.DISORDER), int(Link.DOWN)  # a flag's & is slow
+_DERATED, _LESS = int(Link.DERATED), int(e2e.Report.CLAMPED | e2e.Report.DERATED)
 _REOPEN_S = 1.0  # [s] between attempts to open a bus that went away
 
 
@@ -137,6 +138,8 @@ class CanLink:
         if not self._take_whole(asked):
             self._take_each(asked)
         self._flags |= self.transport.flags() | int(self.bus_state)
+        if self.protected and int(np.bitwise_or.reduce(self._codes[4])) & _LESS:
+            self._flags |= _DERATED
         if self._flags & _DOWN:
             self._reopen(slot)
         q, qd, tau = self._state.copy()

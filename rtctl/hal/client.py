@@ -72,6 +72,10 @@ class Session:
             data = json.dumps(message, allow_nan=False).encode()
         except ValueError as error:  # nan and infinity are not JSON
             raise RequestError(f"not a request: {error}") from None
+        return self.ask_raw(data)
+
+    def ask_raw(self, data: bytes) -> dict[str, Any]:
+        """Return the daemon's reply to a message that is bytes already, as a cloud's is; raises as `ask`."""
         if len(data) > MESSAGE_MAX:
             raise RequestError(f"a request of {len(data)} bytes, at most {MESSAGE_MAX} are taken")
         try:

@@ -12,6 +12,7 @@ import select
 import socket
 import stat
 import struct
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -183,17 +184,17 @@ class Console:
             self.counts["refused"] += 1
             self._reply(peer, {"ok": False, "error": str(error)})
 
-    def _take(self, peer: _Peer, message: messages.Message) -> None:
+    def _take(self, peer: _Peer, message: messages.Message | messages.CloudFrame) -> None:
         """Answer `message` or hold it for the tick. Raises RequestError."""
         match message:
             case messages.Status():
                 self._reply_raw(peer, self._status_reply())
-            case messages.ObstaclesMessage():
-                notices = messages.notices_of(message)
+            case messages.ObstaclesMessage() | messages.CloudFrame(header=messages.CloudMessage(feed=True)):
+                notices = messages.notices_of(message, time.monotonic())
                 self._queue(notices)
                 self._reply(peer, {"ok": True, "accepted": len(notices), "refused": self._camera_refusal})
             case _:
-                request = messages.request_of(message, self._bounds, self._orientation)
+                request = messages.request_of(message, self._bounds, self._orientation, time.monotonic())
                 for edit in request.obstacles:  # newer than what a camera said before
                     self._forget(edit.name)
                 self._held = _Held(peer, request)
@@ -221,8 +222,10 @@ class Console:
         self._notices.pop(name, None)
 
     def _take_edits(self) -> tuple[ObstacleEdit, ...]:
-        """Return the next few edits, each older by the slots that it waited."""
-        taken = [self._notices.pop(name) for name in list(self._notices)[:EDITS_PER_SLOT]]
+        """Return the next few edits, or one cloud, each older by the slots that it waited."""
+        names = list(self._notices)[:EDITS_PER_SLOT]
+        heavy = next((k for k, name in enumerate(names) if self._notices[name][0].steps), len(names))
+        taken = [self._notices.pop(name) for name in names[: max(heavy, 1)]]
         return tuple(notice.edit((self._slot - slot) * self._period) for notice, slot in taken)
 
     # -- replies -------------------------------------------------------------------------------------------------

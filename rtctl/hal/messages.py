@@ -1,33 +1,44 @@
 """What may be said to the control socket: checked structs, and the requests of the tick that they become.
 
 JSON, strict: no unknown keys, no NaN or infinity, every number bounded on both sides, every list of a largest length.
+A cloud of points is one binary message: CLOUD_MARK, the length of a JSON header (u32, little-endian), that header, and
+six bytes for each point, x, y, z in whole steps as int16. 10,000 points are 60 kB, so a message holds the largest.
 """
 
 import math
+import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from rtctl.config.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.config.obstacles import (
+    Cloud,
+    Mesh,
     Name,
     Obstacle,
     Orientation,
     Place,
     RollPitchYaw,
     contradiction,
-    orientation_contradiction,
-    quaternion,
     shape_of,
 )
+from rtctl.control.task import point_of, within
 from rtctl.errors import RequestError
 from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
 
 OBSTACLES_MAX = 64  # in one camera frame
+CLOUD_MARK = b"RTCLOUD1"
+_LENGTH = struct.Struct("<I")
 
-Age = Annotated[float, Meta(ge=0.0, le=10.0)]
+AGE_MAX = 10.0  # [s]
+Age = Annotated[float, Meta(ge=0.0, le=AGE_MAX)]
+Stamp = Annotated[
+    float, Meta(ge=0.0, le=1e12, description="of the observation, CLOCK_MONOTONIC [s], in place of age_s")
+]
 NameOrAll = Annotated[str, Meta(max_length=32, pattern=r"^(\*|[A-Za-z0-9][A-Za-z0-9_.+-]*)$")]
 
 
@@ -60,12 +71,15 @@ class Status(_Message, tag="status", frozen=True):
 
 
 class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
-    """Move the tip; without an orientation the task is the position alone."""
+    """Move the tip: position (or `axes` of it), orientation, direction of a tool axis; the rest stays free."""
 
-    position_m: Place
+    position_m: Place | None = None
+    axes: Axes | None = None
     wxyz: Orientation | None = None
     rpy_rad: RollPitchYaw | None = None
     hold: Literal["orientation"] | None = None
+    direction: Direction | None = None
+    tool_axis: ToolAxis | None = None
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=0.1)] | None = None
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
 
@@ -76,20 +90,43 @@ class ObstacleMessage(_Message, tag="obstacle", frozen=True, kw_only=True):
     set: Obstacle | None = None
     clear: NameOrAll | None = None
     age_s: Age = 0.0
+    stamp_s: Stamp | None = None
 
 
 class ObstaclesMessage(_Message, tag="obstacles", frozen=True, kw_only=True):
-    """One frame of a camera; obstacles that it does not name stay as they were."""
+    """One frame of a camera; obstacles that it does not name stay as they were.
+
+    Whatever a camera has shown must be shown again within `safety.obstacle_stale_s`, also what rests, or be cleared.
+    """
 
     set: Annotated[tuple[Obstacle, ...], Meta(max_length=OBSTACLES_MAX)]
     clear: Annotated[tuple[Name, ...], Meta(max_length=OBSTACLES_MAX)] = ()
     age_s: Age = 0.0
+    stamp_s: Stamp | None = None
+
+
+class CloudMessage(_Message, tag="cloud", frozen=True, kw_only=True):
+    """The header of a cloud; `feed`: a camera's, which sends the next one soon, told without waiting for the tick."""
+
+    set: Cloud
+    step_m: Annotated[float, Meta(ge=1e-6, le=0.01)]
+    feed: bool = False
+    age_s: Age = 0.0
+    stamp_s: Stamp | None = None
+
+
+class CloudFrame(NamedTuple):
+    """A cloud as it came: header and points."""
+
+    header: CloudMessage
+    steps: bytes
 
 
 Message = Arm | Disarm | Stop | Reset | Recover | Status | GoalMessage | ObstacleMessage | ObstaclesMessage
 VERBS = {Arm: Verb.ARM, Disarm: Verb.DISARM, Stop: Verb.STOP, Reset: Verb.RESET, Recover: Verb.RECOVER}
 
 _decoder = msgspec.json.Decoder(Message, strict=True)
+_cloud_decoder = msgspec.json.Decoder(CloudMessage, strict=True)
 
 
 class Bounds(NamedTuple):
@@ -99,30 +136,66 @@ class Bounds(NamedTuple):
     radius: float  # [m]
     tolerance: float  # [m]
     tolerance_rot: float  # [rad]
+    axes: Task = Task.POSE  # of the tip that the arm can move
 
 
-def decode(raw: bytes | memoryview) -> Message:
+def cloud_message(header: dict[str, Any], steps: bytes) -> bytes:
+    """Return the binary message of a cloud; what a camera's driver sends."""
+    text = msgspec.json.encode({"verb": "cloud", **header})
+    return CLOUD_MARK + _LENGTH.pack(len(text)) + text + steps
+
+
+def decode(raw: bytes | memoryview) -> Message | CloudFrame:
     """Return the message in `raw`. Raises RequestError on anything but a complete, well-formed one."""
+    if bytes(raw[: len(CLOUD_MARK)]) == CLOUD_MARK:
+        return _cloud_of(bytes(raw))
     try:
         message: Message = _decoder.decode(raw)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise RequestError(f"not understood: {error}") from None
     for path, obstacle in _obstacles(message):
-        if found := contradiction(obstacle):
-            key, got, wanted = found
-            raise RequestError(f"{path}.{key}: got {got}, wanted {wanted}")
-        if obstacle.waypoints or obstacle.appears_s != 0.0 or obstacle.vanishes_s != 1e6:
-            raise RequestError(f"{path}: a timetable belongs in a scenario; say where the obstacle is now")
+        if isinstance(obstacle, Cloud):
+            raise RequestError(f"{path}: a cloud comes as a binary message; rtctl obstacle set sends one from a file")
+        _refuse(path, obstacle)
     return message
 
 
-def request_of(message: Message, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Request:
-    """Return what the tick gets; `orientation` says the tip's wxyz, for a goal that holds it. Raises RequestError."""
+def _cloud_of(raw: bytes) -> CloudFrame:
+    """Return the cloud of a binary message. Raises RequestError; the points themselves are judged by the tick."""
+    start = len(CLOUD_MARK) + _LENGTH.size
+    length = _LENGTH.unpack_from(raw, len(CLOUD_MARK))[0] if len(raw) >= start else len(raw)
+    try:
+        header = _cloud_decoder.decode(raw[start : start + length])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise RequestError(f"not understood: {error}") from None
+    _refuse("cloud.set", header.set)
+    return CloudFrame(header, raw[start + length :])
+
+
+def _refuse(path: str, obstacle: Obstacle) -> None:
+    """Raise RequestError for an obstacle that contradicts itself, has a timetable, or wants a file to be opened."""
+    if found := contradiction(obstacle):
+        key, got, wanted = found
+        raise RequestError(f"{path}.{key}: got {got}, wanted {wanted}")
+    if obstacle.waypoints or obstacle.appears_s != 0.0 or obstacle.vanishes_s != 1e6:
+        raise RequestError(f"{path}: a timetable belongs in a scenario; say where the obstacle is now")
+    if isinstance(obstacle, Mesh | Cloud) and obstacle.file is not None:
+        # the daemon opens no file that a peer names: it may run as another user, and must not wait for a disk
+        raise RequestError(f"{path}.file: got {obstacle.file!r}, wanted mesh = the name of a [[mesh]] of the config")
+
+
+def request_of(
+    message: Message | CloudFrame, bounds: Bounds, orientation: Callable[[], Sequence[float]], now: float = math.nan
+) -> Request:
+    """Return what the tick gets; `orientation` says the tip's wxyz, for a goal that holds it. Raises RequestError.
+
+    now: as in `notices_of`.
+    """
     match message:
         case GoalMessage():
             return Request(goal=_goal_of(message, bounds, orientation))
-        case ObstacleMessage() | ObstaclesMessage():
-            return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message)))
+        case ObstacleMessage() | ObstaclesMessage() | CloudFrame():
+            return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message, now)))
         case Status():
             return Request()
         case _:
@@ -135,43 +208,61 @@ class Notice(NamedTuple):
     name: str
     obstacle: Obstacle | None  # None: it is gone
     age: float  # [s] when it came
+    feed: bool = False  # from a camera, which will show it again
+    steps: bytes = b""  # of a cloud: its points
+    step: float = 0.0  # [m]
 
     def edit(self, waited: float) -> ObstacleEdit:
         """Return the edit for a tick that comes `waited` [s] later."""
         shape = None if self.obstacle is None else shape_of(self.obstacle)
-        return ObstacleEdit(self.name, shape, self.age + waited)
+        if shape is not None and self.steps:
+            shape = shape._replace(dims=np.array([shape.dims[0], self.step, 0.0, 0.0]), cloud=self.steps)
+        return ObstacleEdit(self.name, shape, self.age + waited, self.feed)
 
 
-def notices_of(message: ObstacleMessage | ObstaclesMessage) -> list[Notice]:
-    """Return one notice per obstacle that is set or cleared; the name "*" clears all. Raises RequestError."""
+def notices_of(message: ObstacleMessage | ObstaclesMessage | CloudFrame, now: float = math.nan) -> list[Notice]:
+    """Return one notice per obstacle that is set or cleared; the name "*" clears all. Raises RequestError.
+
+    now: CLOCK_MONOTONIC [s], for observations that carry a stamp in place of an age.
+    """
+    if isinstance(message, CloudFrame):
+        header = message.header
+        return [Notice(header.set.name, header.set, _age(header, now), header.feed, message.steps, header.step_m)]
+    age = _age(message, now)
     if isinstance(message, ObstaclesMessage):
-        gone = [Notice(name, None, message.age_s) for name in message.clear]
-        return gone + [Notice(obstacle.name, obstacle, message.age_s) for obstacle in message.set]
+        gone = [Notice(name, None, age) for name in message.clear]
+        return gone + [Notice(obstacle.name, obstacle, age, True) for obstacle in message.set]
     if message.set is not None and message.clear is None:
-        return [Notice(message.set.name, message.set, message.age_s)]
+        return [Notice(message.set.name, message.set, age)]
     if message.clear is not None and message.set is None:
-        return [Notice(message.clear, None, message.age_s)]
+        return [Notice(message.clear, None, age)]
     raise RequestError("obstacle: got both or neither of set and clear, wanted one")
 
 
+def _age(message: ObstacleMessage | ObstaclesMessage | CloudMessage, now: float) -> float:
+    """Return how old an observation is [s], the time that its message took included where it carries a stamp."""
+    if message.stamp_s is None:
+        return message.age_s
+    age = now - message.stamp_s
+    if message.age_s != 0.0 or not 0.0 <= age <= AGE_MAX:
+        got = "an age beside it" if message.age_s != 0.0 else f"a time {age:.3f} s ago"
+        raise RequestError(f"stamp_s: got {got}, wanted CLOCK_MONOTONIC of the last {AGE_MAX:g} s alone")
+    return age
+
+
 def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Goal:
-    away = math.dist(message.position_m, bounds.centre)
-    if away > bounds.radius:
-        raise RequestError(f"goal.position_m: got {away:.3f} m from the base, wanted at most {bounds.radius:.3f} m")
-    if found := orientation_contradiction(message.rpy_rad, message.wxyz):
+    if found := goal_contradiction(message):
         key, got, wanted = found
         raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
-    oriented = message.rpy_rad is not None or message.wxyz is not None
-    if message.hold and oriented:
-        raise RequestError("goal.hold: got an orientation beside it, wanted one of them")
-    wxyz = np.array(orientation(), dtype=np.float64) if message.hold else quaternion(message.rpy_rad, message.wxyz)
-    return Goal(
-        position=np.array(message.position_m, dtype=np.float64),
-        wxyz=wxyz,
-        task=Task.POSE if oriented or message.hold else Task.POSITION,
-        tolerance=bounds.tolerance if message.tolerance_m is None else message.tolerance_m,
-        tolerance_rot=bounds.tolerance_rot if message.tolerance_rad is None else message.tolerance_rad,
-    )
+    goal = goal_from(message, lambda: np.array(orientation()), bounds.tolerance, bounds.tolerance_rot)
+    task, why = within(goal.task, bounds.axes)
+    if why:
+        raise RequestError(why)
+    centre = np.array(bounds.centre)
+    away = math.dist(point_of(goal._replace(task=task), centre), centre)  # what is free is no further than it need be
+    if away > bounds.radius:
+        raise RequestError(f"goal.position_m: got {away:.3f} m from the base, wanted at most {bounds.radius:.3f} m")
+    return goal
 
 
 def _obstacles(message: Message) -> Iterator[tuple[str, Obstacle]]:

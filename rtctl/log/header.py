@@ -1,9 +1,9 @@
 """The header of a log: everything that is known before the first tick, enough to replay the log alone."""
 
-import base64
 import json
 import platform
 import subprocess
+from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
 
 PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
 
 SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing
 
+MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
 
 
@@ -71,6 +73,24 @@ def make_header(
     )
 
 
+def meshes_to_files(meshes: Meshes) -> dict[str, str]:
+    """Return the robot's solids as attachments, so that a log can be replayed without the files they came from."""
+    stops = [*meshes.starts[1:], len(meshes.data)]
+    parts = zip(meshes.names, meshes.starts, stops, strict=False)
+    return {MESH + name: b64encode(meshes.data[start:stop].tobytes()).decode() for name, start, stop in parts}
+
+
+def meshes_of(header: Header) -> Meshes:
+    """Return the solids that `meshes_to_files` attached, for the robot of a replay. Raises ValueError."""
+    meshes = NONE
+    for name, text in header.files.items():
+        if name.startswith(MESH):
+            meshes = added(
+                meshes, name.removeprefix(MESH), np.frombuffer(b64decode(str(text), validate=True), np.float64)
+            )
+    return meshes
+
+
 def versions() -> dict[str, str]:
     """Return the versions of the interpreter, the kernel and the packages that decide the results."""
     found = {"python": platform.python_version(), "kernel": platform.release(), "machine": platform.machine()}
@@ -117,11 +137,11 @@ def header_to_json(header: Header) -> str:
 
 
 def _to_text(content: str | bytes) -> str | list[str]:
-    return content if isinstance(content, str) else [base64.b64encode(content).decode()]
+    return content if isinstance(content, str) else [b64encode(content).decode()]
 
 
 def _from_text(value: Any) -> str | bytes:
-    return base64.b64decode(value[0]) if isinstance(value, list) else str(value)
+    return b64decode(value[0]) if isinstance(value, list) else str(value)
 
 
 def of_attachment(name: str, data: bytes) -> str | bytes:

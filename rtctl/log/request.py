@@ -1,5 +1,6 @@
 """Requests and events as JSON: the only inputs of a tick that have no fixed size. Floats round-trip to the bit."""
 
+import base64
 from typing import Any
 
 import msgspec
@@ -15,7 +16,7 @@ def encode_request(tick: int, request: Request) -> bytes:
         body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items()}
     if request.obstacles:
         body["obstacles"] = [
-            {"name": e.name, "age": e.age, "shape": None if e.shape is None else _shape(e.shape)}
+            {"name": e.name, "age": e.age, "feed": e.feed, "shape": None if e.shape is None else _shape(e.shape)}
             for e in request.obstacles
         ]
     return msgspec.json.encode(body)
@@ -27,7 +28,12 @@ def decode_request(data: bytes) -> tuple[int, Request]:
         body = msgspec.json.decode(data)
         goal = body.get("goal")
         edits = tuple(
-            ObstacleEdit(e["name"], None if e["shape"] is None else _shape_of(e["shape"]), float(e["age"]))
+            ObstacleEdit(
+                e["name"],
+                None if e["shape"] is None else _shape_of(e["shape"]),
+                float(e["age"]),
+                bool(e.get("feed", False)),  # logs of before there were feeds have none
+            )
             for e in body.get("obstacles", ())
         )
         return int(body["tick"]), Request(Verb[body["verb"].upper()], None if goal is None else _goal(goal), edits)
@@ -49,8 +55,19 @@ def _shape(shape: Shape) -> dict[str, Any]:
 
 
 def _shape_of(body: dict[str, Any]) -> Shape:
-    arrays = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
-    return Shape(name=body["name"], type=body["type"], **arrays)
+    numbers = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
+    return Shape(
+        body["name"],
+        body["type"],
+        numbers["dims"],
+        numbers["position"],
+        numbers["wxyz"],
+        numbers["velocity"],
+        numbers["omega"],
+        str(body.get("group", "")),  # logs of before there were such have none
+        str(body.get("mesh", "")),
+        base64.b64decode(body.get("cloud", ""), validate=True),  # as on the wire: 60 kB at most
+    )
 
 
 def _goal(body: dict[str, Any]) -> Goal:
@@ -60,4 +77,5 @@ def _goal(body: dict[str, Any]) -> Goal:
         Task(body["task"]),
         float(body["tolerance"]),
         float(body["tolerance_rot"]),
+        np.array(body["axis"], np.float64),
     )

@@ -1,11 +1,16 @@
 """Tests in tests/hil/guest need SocketCAN; outside, each is reported with what it did beside vcan0.
 
 All that are selected run in one pytest beside vcan0 (tools.vcan: a namespace or a guest), which writes one JSON line a
-report; here stand items that turn those lines back into passed, failed and skipped.
+report; here stand items that turn those lines back into passed, failed and skipped. That pytest runs beside the tests
+on the host, which take about as long.
 """
 
+import functools
 import json
 import os
+import shlex
+import signal
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -16,6 +21,12 @@ import pytest
 from tools import vcan
 
 GUEST = Path(__file__).resolve().parent / "guest"
+ROOT = GUEST.parent.parent.parent
+WARM = """
+from rtctl import config
+from rtctl.control import pipe
+pipe.warm(config.build(config.load("configs/panda.toml"), "configs/panda.toml"))
+"""
 REPORTS = "RTCTL_VCAN_REPORTS"  # file that the pytest beside vcan0 appends to
 TIMEOUT = 1500.0  # [s] for all of them together
 INSIDE = vcan.available().kind == "here"
@@ -26,24 +37,43 @@ class RemoteFailure(Exception):
     """What went wrong beside vcan0, as its pytest tells it."""
 
 
-class Results(dict[str, list[dict[str, Any]]]):
-    """Reports by node id, and the output of the pytest that made them."""
+class Results:
+    """Reports by node id, from a pytest beside vcan0 that runs in the background until somebody asks."""
 
     def __init__(self, ids: list[str]) -> None:
-        super().__init__()
-        with tempfile.NamedTemporaryFile(prefix="rtctl-reports-", suffix=".jsonl", dir="/tmp") as file:
-            env = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {REPORTS: file.name}
-            command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *ids]
-            output = bytearray()
-            root = GUEST.parent.parent.parent
-            try:
-                status = vcan.run(command, timeout=TIMEOUT, cwd=root, env=env, out=output.extend, err=output.extend)
-                self.account = f"exit status {status}\n{output.decode(errors='replace')[-8000:]}"
-            except vcan.VcanError as error:
-                self.account = f"{error}\n{output.decode(errors='replace')[-8000:]}"
-            for line in Path(file.name).read_text().splitlines():
-                report = json.loads(line)
-                self.setdefault(report["id"], []).append(report)
+        self.folder = tempfile.TemporaryDirectory(prefix="rtctl-reports-", dir="/tmp")
+        self.output, self.lines = (Path(self.folder.name) / name for name in ("output", "lines"))
+        self.lines.touch()
+        tests = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *ids]
+        beside = [sys.executable, "-m", "tools.vcan", "--timeout", str(TIMEOUT), "--", *tests]
+        # A guest sees the compiled kernels that are in the cache when it starts.
+        command = f"{shlex.join([sys.executable, '-c', WARM])} && exec {shlex.join(beside)}"
+        env = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {REPORTS: str(self.lines)}
+        with self.output.open("wb") as out:
+            self.process = subprocess.Popen(
+                ["sh", "-c", command], cwd=ROOT, env=env, stdout=out, stderr=out, start_new_session=True
+            )
+
+    @functools.cached_property
+    def reports(self) -> dict[str, list[dict[str, Any]]]:
+        """Every report by node id, once all are there."""
+        self.process.wait()
+        found: dict[str, list[dict[str, Any]]] = {}
+        for line in self.lines.read_text().splitlines():
+            report = json.loads(line)
+            found.setdefault(report["id"], []).append(report)
+        return found
+
+    def account(self) -> str:
+        """Exit status and the end of the output."""
+        return f"exit status {self.process.wait()}\n{self.output.read_text(errors='replace')[-8000:]}"
+
+    def close(self) -> None:
+        """Stop it if it still runs."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGTERM)
+            self.process.wait()
+        self.folder.cleanup()
 
 
 class RemoteItem(pytest.Item):
@@ -62,14 +92,10 @@ class RemoteItem(pytest.Item):
 
     def runtest(self) -> None:
         require()
-        if RESULTS not in self.session.stash:
-            self.session.stash[RESULTS] = Results(
-                [i.remote_id for i in self.session.items if isinstance(i, RemoteItem)]
-            )
-        results = self.session.stash[RESULTS]
-        if self.remote_id not in results:
-            raise RemoteFailure(f"no report of {self.remote_id} came back: {results.account}")
-        for report in results[self.remote_id]:
+        results = started(self.session)
+        if self.remote_id not in results.reports:
+            raise RemoteFailure(f"no report of {self.remote_id} came back: {results.account()}")
+        for report in results.reports[self.remote_id]:
             for title, content in report["sections"]:
                 self.add_report_section(report["when"], title.removeprefix("Captured "), content)
             if report["outcome"] == "failed":
@@ -79,6 +105,13 @@ class RemoteItem(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         return str(excinfo.value) if isinstance(excinfo.value, RemoteFailure) else super().repr_failure(excinfo, style)
+
+
+def started(session: pytest.Session) -> Results:
+    """The run beside vcan0, started now if it was not."""
+    if RESULTS not in session.stash:
+        session.stash[RESULTS] = Results([i.remote_id for i in session.items if isinstance(i, RemoteItem)])
+    return session.stash[RESULTS]
 
 
 def require() -> vcan.Venue:
@@ -99,13 +132,26 @@ def venue() -> vcan.Venue:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Outside, stand-ins take the place of the tests that need SocketCAN, last: compiled code is cached by then."""
+    """Outside, stand-ins take the place of the tests that need SocketCAN, last: done by then."""
     if INSIDE:
         return
     for i, item in enumerate(items):
         if isinstance(item, pytest.Function) and item.path.is_relative_to(GUEST) and item.parent is not None:
             items[i] = RemoteItem.from_parent(item.parent, name=item.name, function=item)
     items.sort(key=lambda item: isinstance(item, RemoteItem))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """The guest starts first; a worker of xdist, which may never come to its tests, starts it when it does."""
+    wanted = any(isinstance(item, RemoteItem) for item in session.items) and not session.config.option.collectonly
+    if wanted and vcan.available() and "PYTEST_XDIST_WORKER" not in os.environ:
+        started(session)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Nothing outlives the session."""
+    if RESULTS in session.stash:
+        session.stash[RESULTS].close()
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

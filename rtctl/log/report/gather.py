@@ -1,5 +1,6 @@
 """Everything a report shows, gathered in one pass over the log, a piece at a time: any length fits into memory."""
 
+import math
 import tomllib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -139,7 +140,7 @@ class _Slots:
             x, y, z = (round(float(v), 4) for v in goal["position"])
         except (KeyError, TypeError, ValueError):
             return
-        if not self.goals or self.goals[-1] != [x, y, z]:
+        if all(map(math.isfinite, (x, y, z))) and (not self.goals or self.goals[-1] != [x, y, z]):
             self.goals.append([x, y, z])
 
     def _seen(self, shape: dict[str, Any]) -> None:

@@ -24,10 +24,11 @@ TIP_POINTS = 1500
 
 def page(run: Run, g: Gathered) -> str:
     """Return the page's text."""
+    pack = _Pack(g)
     data = {
         "duration": g.figures["duration_s"],
-        "packed": base64.b64encode(zlib.compress(_Pack(g).bytes, 9)).decode(),
-        **_Pack(g).index,
+        "packed": base64.b64encode(zlib.compress(pack.bytes, 9)).decode(),
+        **pack.index,
         "statuses": _spans(g.statuses),
         "states": _spans(g.states),
         "faults": _spans(g.faults),
@@ -47,11 +48,22 @@ def page(run: Run, g: Gathered) -> str:
         "events": _events(g),
         "config": html.escape(g.header.config or "none attached"),
         "details": _details(run, g),
-        "data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
+        "data": json.dumps(_finite(data), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
         "script": _asset("page.js"),
     }.items():
         text = text.replace("{{" + key + "}}", value, 1)
     return text
+
+
+def _finite(value: Any) -> Any:
+    """Return plain values with null for what JSON has no number for."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return value
 
 
 @cache

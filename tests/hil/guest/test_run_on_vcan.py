@@ -19,6 +19,7 @@ WATCHDOG = 0.020  # [s] of configs/panda.toml
 STEP = 0.0005  # [s] of the drives' own clock
 STILL = 0.01  # [m/s] a drive cannot say 0: the nearest it can is 2.4 mrad/s
 WATCHDOG_BIT, BRAKE_BIT = 1, 16  # of a reply's status byte
+ACTIVE = "20000004#0040000000000000"  # error frame: the controller is error-active again
 REST = 0.5  # [s] from the last command until every joint stands, whatever happens
 
 
@@ -33,7 +34,7 @@ def bring_up() -> None:
 
 
 class Beside(Rig):
-    """A rig whose controller is replaced when a test has used it up."""
+    """A rig whose controller is replaced when a test has used it up, on a bus that is mended before each test."""
 
     controlling: Process | None = None
 
@@ -46,6 +47,7 @@ class Beside(Rig):
     def ready(self) -> Process:
         """Have drives and a controller that an operator can set going; return the controller."""
         run(f"ip link set {CHANNEL} up")
+        run(f"cansend {CHANNEL} {ACTIVE}")
         if self.plant is None:
             self.drives()
         if self.controlling is None or self.controlling.popen.poll() is not None:
@@ -110,12 +112,12 @@ def test_a_second_controller_on_the_interface_is_refused(rig: Beside, controller
 
 
 def test_error_passive_is_told_and_refuses_arming_while_it_lasts(rig: Beside) -> None:
-    run(f"cansend {CHANNEL} 20000004#0030000000000000")
-    until(lambda: "error_passive" in rig.status()["faults"], lambda: f"not noticed: {rig.status()}")
     assert rig.ask("disarm")["ok"]
     rig.reach("IDLE")
+    run(f"cansend {CHANNEL} 20000004#0030000000000000")
+    until(lambda: "error_passive" in rig.status()["faults"], lambda: f"not noticed: {rig.status()}")
     assert rig.ask("arm")["error"].startswith("arm: error_passive")
-    run(f"cansend {CHANNEL} 20000004#0040000000000000")  # error-active again
+    run(f"cansend {CHANNEL} {ACTIVE}")
     until(lambda: rig.ask("arm")["ok"], lambda: f"still refused: {rig.status()}")
 
 

@@ -1,0 +1,118 @@
+"""Faults of drives and encoders on the plant: seen within their time, and nothing else is taken for one."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtctl.control import faults
+from rtctl.servo import Turn
+from rtctl.types import F64, Link, Request, State, Verb
+from tests.lab import DOWN, Standing, lab, robot
+
+JOINT = 1  # carries the arm's weight
+WARNED = Link.DERATED
+
+
+def broken(inject: str, seconds: float, reach: list[float] | None = None) -> tuple[set[str], float, list[Turn], F64]:
+    """Return the faults, when [s] after 1 s the arm left RUN (-1: never), all turns and qd at the end."""
+    with lab(inject=(inject,) if inject else ()) as here:
+        here.running()
+        here.ask([0.5, 0.3, 0.5] if reach is None else reach, DOWN)
+        left = -1.0
+        while here.simulator.time < 1.0 + seconds:
+            here.step()
+            if left < 0.0 and here.simulator.time > 1.0 and here.memory.state != State.RUN:
+                left = here.simulator.time - 1.0
+        return set(faults.names(here.servo.faults_seen)), left, here.turns, here.simulator.truth().qd.copy()
+
+
+def test_a_motor_that_gives_half_its_torque_stops_the_arm_though_the_slew_follows_it():
+    seen, after, _, _ = broken(f"weak@1.0:{JOINT}", 0.2)
+    assert "torque_mismatch" in seen
+    assert 0.0 < after < 0.02
+
+
+def test_a_drive_that_says_it_gives_less_is_believed():
+    arm = Standing()
+    arm.ticks(5)
+    half = {"tau": arm.command.tau * np.where(np.arange(7) == JOINT, 0.5, 1.0), "link": int(WARNED)}
+    arm.ticks(4, **half)
+    assert arm.memory.pulled
+    assert arm.memory.counters.pulled == 0
+    arm.ticks(4, **{**half, "link": 0})
+    assert arm.memory.counters.pulled >= 3
+
+
+# ---- encoder
+
+
+def test_one_jump_of_an_encoder_is_dropped_and_reaches_no_filter():
+    arm = Standing()
+    arm.ticks(20)
+    before = arm.memory.joints
+    wrong = arm.q + np.where(np.arange(7) == 1, 0.5, 0.0)
+    arm.tick(q=wrong)
+    np.testing.assert_allclose(arm.memory.joints.q, before.q, atol=1e-4)
+    np.testing.assert_allclose(arm.memory.joints.qd, before.qd, atol=1e-2)
+    np.testing.assert_array_equal(arm.record["q"][0], wrong)  # the log has what was said
+    arm.ticks(100)
+    assert arm.state() == State.RUN
+    assert not arm.present
+
+
+def test_an_encoder_that_stays_off_stops_the_arm_smoothly():
+    seen, after, turns, qd = broken("encoder_jump@1.0:3", 0.5)
+    assert "encoder_jump" in seen
+    assert 0.0 < after < 0.01
+    ratios = np.array([np.abs(turn.command.tau) / robot().tau_rated for turn in turns])
+    assert ratios.max() < 0.7  # no kick from a filter that saw the jump
+    assert np.abs(qd).max() < 0.3
+
+
+# ---- deadlines
+
+
+@pytest.mark.parametrize(("state", "held"), [(State.IDLE, False), (State.RUN, True)])
+def test_a_missed_deadline_matters_where_torque_flows(state: State, held: bool):
+    arm = Standing(state)
+    late: dict[str, Any] = {"missed": 12}
+    arm.tick(**late)
+    assert ("deadline" in arm.present) == held
+    if not held:
+        arm.ticks(60)
+        assert arm.ask(Verb.ARM) == ""
+
+
+def test_recovering_from_beyond_a_limit_is_slow_whatever_pushes():
+    """The limit's potential pushes with all the motor has; the guard keeps a tenth of qd_max all the same."""
+    arm = robot()
+    for joint, beyond in ((3, 0.06), (5, -0.1)):
+        q = arm.home.copy()
+        q[joint] = (arm.q_max if beyond > 0.0 else arm.q_min)[joint] + beyond
+        fastest = 0.0
+        with lab(q.tolist()) as here:
+            here.step(Request(Verb.RECOVER))
+            for _ in range(900):
+                here.step()
+                truth = here.simulator.truth()
+                if not ((truth.q < arm.q_min) | (truth.q > arm.q_max)).any():
+                    break
+                fastest = max(fastest, float((np.abs(truth.qd) / arm.qd_max).max()))
+            else:
+                raise AssertionError("still beyond the limit")
+            assert here.memory.state == State.RUN
+        assert 0.02 < fastest < 0.12
+
+
+@pytest.mark.parametrize("joint", [0, 1, 3, 5])
+def test_an_encoder_that_sticks_while_its_joint_moves_stops_the_arm(joint: int):
+    seen, after, _, _ = broken(f"stuck_encoder@1.0:{joint}", 0.15)
+    assert seen & {"encoder_stuck", "innovation"}
+    assert 0.0 < after < 0.1
+
+
+def test_an_encoder_whose_speed_is_wrong_stops_the_arm():
+    seen, after, _, _ = broken("false_velocity@1.0:3", 0.1)
+    assert "velocity_mismatch" in seen
+    assert 0.0 < after < 0.05

@@ -1,0 +1,111 @@
+"""The stress set: its generator keeps its rule, its judge sees what is wrong, and a few of its scenarios hold."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_sim.plant import Contact
+from rtctl.config.scenario import load_scenario, scenario_dict
+from tests.lab import robot
+from tools.stress import judge
+from tools.stress.play import Seen, play, robot_of
+from tools.stress.scene import scenario_of, toml_of
+
+BRIEF = 2.0  # [s] that is played here of each
+
+
+def seen(**changes: Any) -> Seen:
+    """Return what a run shows in which nothing is wrong."""
+    good: dict[str, Any] = {
+        "robot": "panda", "index": 0, "duration": 5.0, "arrived": True, "error": 0.0, "contact": None, "retreat": 0.0,
+        "can_retreat": 0.0, "finite": True, "torque": 1.0, "rate": 1.0, "joint_speed": 1.0, "tip_speed": 1.0,
+        "margin": 0.0, "clearance": 0.1, "own": 0.1, "recent_torque": 0.1, "recent_speed": 0.1, "recent_tip": 0.1,
+        "stopped": "", "faults": (), "status": "arrived", "detail": "", "statuses": (), "diagnosis": "", "digest": "",
+    }  # fmt: skip
+    return Seen(**(good | changes))
+
+
+def met(cause: str, arm: float) -> Contact:
+    return Contact(1.0, "link", "self:other" if cause == "self" else "ball", cause, arm, 0.2, (0.1,) * 7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"torque": 1.001}, "torque at"),
+        ({"rate": 1.001}, "torque rate at"),
+        ({"joint_speed": 1.001}, "joint speed at"),
+        ({"tip_speed": 1.03}, "tip speed at"),
+        ({"margin": -0.001}, "beyond its limit"),
+        ({"finite": False}, "not a number"),
+        ({"torque": np.nan}, "torque at"),
+        ({"faults": ("overspeed",)}, "fault overspeed"),
+        ({"diagnosis": "limited by joint 3, which is free"}, "untrue"),
+        ({"contact": met("arm", 0.1)}, "ran into"),
+        ({"contact": met("obstacle", 0.1)}, "ran into"),  # slower than the obstacle, but closing
+        ({"contact": met("self", 0.0)}, "touched itself"),
+        ({"contact": met("obstacle", -0.05), "retreat": 0.05, "can_retreat": 0.5}, "down, which fled at"),
+    ],
+)
+def test_the_judge_names_what_is_wrong(changes: dict[str, Any], said: str):
+    broken = judge.failures(robot(), seen(**changes))
+    assert len(broken) == 1
+    assert said in broken[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"contact": met("obstacle", -0.5), "retreat": 0.5, "can_retreat": 0.5},
+        {"contact": met("obstacle", -0.1), "can_retreat": 0.5, "recent_speed": 0.9},
+    ],
+)
+def test_the_judge_lets_pass_what_is_right(changes: dict[str, Any]):
+    assert judge.failures(robot(), seen(**changes)) == []
+
+
+def test_a_scenario_is_the_same_for_ever_and_from_its_file(tmp_path: Path):
+    arm, config = robot_of("panda")
+    for index in range(4):
+        one, two = (scenario_of(arm, config, 0, index) for _ in range(2))
+        assert one == two
+        path = tmp_path / f"{index}.toml"
+        path.write_text(toml_of(one, "a comment"))
+        read = scenario_dict(load_scenario(path), path)
+        for key, value in one.items():
+            if key not in ("goal", "obstacle"):
+                assert np.array_equal(read[key], value)
+        for key in ("goal", "obstacle"):
+            for row, wanted in zip(read[key], one[key], strict=True):
+                assert all(np.array_equal(row[k], v) for k, v in wanted.items())
+    assert scenario_of(arm, config, 1, 0) != scenario_of(arm, config, 0, 0)
+
+
+@pytest.mark.parametrize("name", ["planar4", "puma560", "panda", "ur5", "openarm"])
+def test_a_scenario_of_each_robot_breaks_nothing(name: str):
+    arm, config = robot_of(name)
+    table = scenario_of(arm, config, 0, 1) | {"duration_s": BRIEF}
+    run = play(table, 1)
+    assert judge.failures(arm, run) == []
+    assert run.duration > BRIEF - 0.1
+    assert run.joint_speed > 0.05  # it did move
+
+
+def test_the_column_run_down_is_no_violation_of_any_bound():
+    """A ball drives through the shoulder: the arm cannot flee, and does not whirl about for it."""
+    ball = {
+        "name": "ball",
+        "type": "sphere",
+        "radius_m": 0.1,
+        "position_m": [-0.6, 0.1, 0.33],
+        "velocity_m_s": [0.25, 0.0, 0.0],
+    }
+    run = play({"robot": "panda", "duration_s": 2.5, "obstacle": [ball]}, 0)
+    assert run.contact is not None
+    assert run.contact.arm_m_s < judge.CLOSING
+    assert max(run.torque, run.joint_speed, run.tip_speed) <= 1.0
+    assert run.rate <= 1.0 + 1e-9
+    assert run.margin > 0.0
