@@ -148,6 +148,8 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     digest = hashlib.sha256()
     begun, done = time.perf_counter(), 0
     for block in _blocks(inputs(run.logs)):
+        if not done and int(block[0].record["tick"]) != 0:
+            raise LogError(f"{run.path}: begins with tick {block[0].record['tick']}; what was before it is missing")
         wire.prime(block[0].log_time)
         records, sent = [], []
         for logged in block:

@@ -136,11 +136,11 @@ def test_a_changed_command_byte_is_found_on_the_wire(log: Path, tmp_path: Path, 
     original = module._sent_frames
 
     def flipped(of: Any) -> Any:
-        for time, array in original(of):
+        for stamps, array in original(of):
             array = array.copy()
-            row = np.flatnonzero((time == 400_000_000) & (array["id"] == 5))
+            row = np.flatnonzero((stamps == 400_000_000) & (array["id"] == 5))
             array["data"][row, 7] ^= 1
-            yield time, array
+            yield stamps, array
 
     monkeypatch.setattr(module, "_sent_frames", flipped)
     done = replay(run)
@@ -287,13 +287,13 @@ def test_rerun_opens_the_file_and_finds_the_topics(log: Path, tmp_path: Path):
 
 
 def test_candump_and_blf_give_every_frame_back(log: Path, tmp_path: Path):
-    array, time = read(log)["/can/can0"].array, read(log)["/can/can0"].time
+    array, stamps = read(log)["/can/can0"].array, read(log)["/can/can0"].time
     for name, reader in (("run.log", can.CanutilsLogReader), ("run.blf", can.BLFReader)):
         assert call("export", str(log), "--out", str(tmp_path / name))[0] == 0
         with reader(tmp_path / name) as frames:
             found = list(frames)
         assert len(found) == len(array) > 5000
-        for row, at, message in zip(array, time.tolist(), found, strict=True):
+        for row, at, message in zip(array, stamps.tolist(), found, strict=True):
             assert message.arbitration_id == row["id"]
             assert bytes(message.data) == row["data"][: row["dlc"]].tobytes()
             assert (message.is_fd, message.bitrate_switch) == (bool(row["fd"]), bool(row["brs"]))
