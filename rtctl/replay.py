@@ -3,6 +3,7 @@
 The command frames are made anew by the daemon's own encoder, so that what is compared is what went over the bus.
 """
 
+import gc
 import hashlib
 import json
 import tempfile
@@ -148,6 +149,8 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     digest = hashlib.sha256()
     begun, done = time.perf_counter(), 0
     for block in _blocks(inputs(run.logs)):
+        if not done:
+            gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
         if not done and int(block[0].record["tick"]) != 0:
             raise LogError(f"{run.path}: begins with tick {block[0].record['tick']}; what was before it is missing")
         wire.prime(block[0].log_time)
@@ -163,6 +166,7 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
         wire.compare([logged.log_time for logged in block], ticks, robot.dt, sent)
         done += len(block)
         progress(done)
+    gc.unfreeze()
     seconds = time.perf_counter() - begun
     if not done:
         raise LogError(f"{run.path}: no tick in it")
