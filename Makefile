@@ -1,4 +1,5 @@
 # make demo    install everything, then an arm goes round obstacles: what it does, a summary, a plot, a log
+# make demo-rover    install everything, then a rover goes round four worlds over MAVLink
 # make test    install everything, lint, all tests
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
@@ -13,10 +14,13 @@ SYSTEM := $(VENV)/.system
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint bench stress install lock clean
+.PHONY: demo demo-rover test lint bench stress install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
+
+demo-rover: install
+	$(BIN)/python -m tools.demo_rover
 
 test: install lint
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)

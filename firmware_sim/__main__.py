@@ -20,6 +20,8 @@ from firmware_sim.codec import REGISTER_ID
 from firmware_sim.drive import NS
 from firmware_sim.inject import KINDS
 from firmware_sim.report import Report
+from firmware_sim.rover import is_rover, open_rover
+from firmware_sim.rover_serve import serve
 from firmware_sim.settings import SettingsError
 from firmware_sim.simulator import Simulator, open_simulator
 
@@ -212,6 +214,9 @@ def _scenario(path: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> None:
     """Open everything, serve until a signal, write the report."""
     scenario = _scenario(args.scenario)
+    if is_rover(args.config):
+        serve(open_rover(args.config, scenario, args.inject, wait=not args.now), args.config, args.report)
+        return
     simulator = open_simulator(args.config, scenario, None, args.seed, None, args.inject, wait=not args.now)
     settings = simulator.settings
     bus = open_bus(settings.interface, settings.channel, [*(r.motor for r in settings.ratings), REGISTER_ID])

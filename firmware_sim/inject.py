@@ -59,6 +59,14 @@ def _fault(kind: str, at_s: float, joint: Any, duration_s: float | None, names: 
     return Fault(kind, start, end, _joint(joint, names))
 
 
+def fault_at(kind: str, at_s: float, duration_s: float | None, kinds: Iterable[str]) -> Fault:
+    """Return a fault of the whole machine. SettingsError for a kind that is none of `kinds`."""
+    if kind not in kinds:
+        raise SettingsError(f"fault: {kind} is not one of {', '.join(kinds)}")
+    start = round(at_s * NS)
+    return Fault(kind, start, start + round(duration_s * NS) if duration_s else FOREVER, -1)
+
+
 def faults_of(tables: Iterable[dict[str, Any]], names: Sequence[str]) -> list[Fault]:
     """Return the faults of a scenario's [[fault]] tables."""
     return [_fault(t["kind"], float(t["at_s"]), t.get("joint"), t.get("duration_s"), names) for t in tables]

@@ -16,6 +16,7 @@ from firmware_sim import codec
 from firmware_sim.drive import NS, Drive, State
 from firmware_sim.inject import Injector, faults_of, parse
 from firmware_sim.plant import Plant
+from firmware_sim.rover import is_rover, open_rover
 from firmware_sim.settings import Settings, SettingsError, load
 from firmware_sim.shapes import ObstacleEdit, reported, shape_at
 from rtctl.protocol import frame
@@ -192,6 +193,9 @@ def open_simulator(
     that are random; nothing else is. `inject` holds further faults as `kind@t[:joint[:duration]]`; with `wait` the
     scenario's clock stands at 0 until a drive is enabled. Raises SettingsError.
     """
+    if is_rover(config_path):
+        rover: Any = open_rover(config_path, scenario, inject, wait)  # exchange, truth and close: all that is asked
+        return rover  # type: ignore[no-any-return]
     settings = load(config_path, control_hz)
     play = scenario or {}
     chosen = start_q if start_q is not None else play.get("start_q_rad") or settings.home

@@ -1,27 +1,29 @@
 """`rtctl run`: the servo process. One thread, one absolute grid; all that is slow happens elsewhere."""
 
+import json
 import os
 import select
 import signal
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
 from rtctl.config import Config
+from rtctl.config.base import is_base
 from rtctl.control import faults, task
 from rtctl.control.limits import permit, slew_reference
 from rtctl.control.pipe import warm
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import quat_of
-from rtctl.errors import EXIT_FAILED, EXIT_OK
+from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 from rtctl.hal import clock
 from rtctl.hal.can import CanLink, identifiers
 from rtctl.hal.client import default_path
@@ -31,8 +33,9 @@ from rtctl.hal.messages import Bounds
 from rtctl.hal.recorder import Recorder
 from rtctl.hal.service import InstanceLock, Service, bus_resource
 from rtctl.hal.transport import open_transport
-from rtctl.servo import CAN_RX, CAN_TX, Servo, blocker_name
-from rtctl.types import Command, Drive, Link, State, Verb
+from rtctl.log.header import Header
+from rtctl.servo import ARM, CAN_RX, CAN_TX, Machine, Servo, blocker_name, first_feedback
+from rtctl.types import Command, Drive, Feedback, Link, State, Verb
 
 LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
 LOCKSTEP_SILENT = 0.05  # [s] the same once a slot went without: a drive that fell silent need not be waited for
@@ -65,6 +68,25 @@ def say(text: str, to: int = 1) -> None:
             os.write(to, line[-4096:])  # PIPE_BUF: what a writable pipe is sure to take
 
 
+class Family(NamedTuple):
+    """What an arm and a base do each in their own way; chosen by the config's `robot.kind`."""
+
+    load: Callable[[Path], Any]
+    build: Callable[[Any, Path], Any]
+    warm: Callable[[Any], None]
+    lock: Callable[[Any], tuple[str, str]]  # the resource, and the key that names it
+    place: Callable[[Any], str]  # the link, as people read it
+    open: Callable[[Any, Path], Any]  # the link
+    bounds: Callable[[Any, Any], Bounds]  # (robot, link)
+    greet: Callable[[Any, Any, bool], Any]  # (config, link, lockstep): the first feedback
+    machine: Callable[[Any], Machine]  # (link)
+    header: Callable[[Any, Path, Any, Any], Header]  # (config, path, robot, first feedback)
+    status: Callable[[Servo, Recorder], dict[str, Any]]
+    fallback: Callable[[Servo, Recorder, Iterator[Slot], bool], None]
+    farewell: Callable[[Servo, Recorder], None]
+    names: Callable[[int], tuple[str, ...]]  # of faults
+
+
 def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> int:
     """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
 
@@ -72,23 +94,25 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
     dry: everything is computed and logged, but only stop frames are sent.
     """
     path = Path(config_path)
-    config = cfg.load(path)
+    family = _family(path, lockstep)
+    config = family.load(path)
     signals = Signals()
     with ExitStack() as stack:
-        stack.enter_context(InstanceLock(bus_resource(config.link.interface, config.link.channel), "link.channel"))
-        robot = cfg.build(config, path)
-        warm(robot)
-        bounds = Bounds(tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes)
+        resource, label = family.lock(config)
+        stack.enter_context(InstanceLock(resource, label))
+        robot = family.build(config, path)
+        family.warm(robot)
+        link = stack.enter_context(closing(family.open(config, path)))
+        bounds = family.bounds(robot, link)
         console = stack.enter_context(
             closing(Console(config.console.socket or default_path(robot.name), robot.dt, bounds))
         )
-        link = stack.enter_context(closing(_opened(config)))
-        say(f"rtctl: {robot.name} on {config.link.interface}:{config.link.channel}, console {console.path}")
-        greeting = link.handshake(listen=0.0 if lockstep else 1e-3 * config.link.listen_ms, recover=True)
-        extra = surroundings(config, greeting.watchdogs_written, dry)
-        recorder = _recorder(config, path, robot, greeting.q, link.counters, **extra)
-        servo = Servo(robot, link, recorder, greeting.q, dry)
-        console.publish(lambda: status(servo, recorder))
+        say(f"rtctl: {robot.name} on {family.place(config)}, console {console.path}")
+        start = family.greet(config, link, lockstep)
+        header = family.header(config, path, robot, start)
+        recorder = _recorder(config, header._replace(extra={**header.extra, **surroundings(config, link, dry)}))
+        servo = Servo(robot, link, recorder, np.zeros(0), dry, machine=family.machine(link), start=start)
+        console.publish(lambda: family.status(servo, recorder))
         if not lockstep:
             granted = clock.realtime(
                 config.loop.realtime, -1 if config.loop.cpu is None else config.loop.cpu, config.loop.priority
@@ -104,17 +128,47 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
             code = _loop(servo, console, service, recorder, signals, slots, lockstep)
         except Exception as error:
             failure = error  # told when the drives are safe: to tell it reads files
-            _fallback(servo, recorder, slots, lockstep)
+            family.fallback(servo, recorder, slots, lockstep)
         finally:
-            _stop_frames(link, robot, recorder)
+            family.farewell(servo, recorder)
             stats = recorder.close("stopped" if code == EXIT_OK else "failed")
     if failure is not None:
         say("".join(traceback.format_exception(failure)).rstrip(), to=2)
-    say(_summary(servo, stats.path, stats.dropped))
+    say(_summary(servo, family.names(servo.faults_seen), stats.path, stats.dropped))
     return code
 
 
-def _opened(config: Config) -> CanLink:
+def _family(path: Path, lockstep: bool) -> Family:
+    """Return the functions of the robot that a file describes. Raises RtctlError."""
+    if not is_base(path):
+        return ARM_FAMILY
+    if lockstep:
+        raise UsageError("--lockstep is for drives on a bus; `rtctl sim` plays a base in lockstep")
+    from rtctl import base  # pymavlink is not needed for an arm
+    from rtctl.config.base import load
+    from rtctl.config.base_derive import build
+    from rtctl.control.base import faults as base_faults
+    from rtctl.control.base.pipe import warm as base_warm
+
+    return Family(
+        load=load,
+        build=build,
+        warm=base_warm,
+        lock=lambda config: (bus_resource("mavlink", config.link.url), "link.url"),
+        place=lambda config: config.link.url,
+        open=base.open_link,
+        bounds=base.bounds_of,
+        greet=lambda config, link, lockstep: link.handshake(),
+        machine=base.machine_of,
+        header=base.header_of,
+        status=lambda servo, recorder: base.status(servo, _log_status(recorder)),
+        fallback=lambda servo, recorder, slots, lockstep: base.fallback(servo, recorder, slots),
+        farewell=lambda servo, recorder: base.farewell(servo, recorder),
+        names=base_faults.names,
+    )
+
+
+def _opened(config: Config, path: Path) -> CanLink:
     spec = link_spec(config)
     transport = open_transport(
         config.link.interface,
@@ -128,28 +182,29 @@ def _opened(config: Config) -> CanLink:
     return CanLink(spec, transport)
 
 
-def surroundings(config: Config, watchdogs: tuple[str, ...], dry: bool) -> dict[str, str]:
-    """Return what a log should tell of the machine and the handshake."""
+def surroundings(config: Any, link: Any, dry: bool) -> dict[str, str]:
+    """Return what a log should tell of the machine, and of the link after its handshake."""
     clocksource = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     kernel = Path("/sys/kernel/realtime")
     return {
         "dry": str(int(dry)),
         "realtime": config.loop.realtime,
-        "cpu": str(config.loop.cpu),
-        "priority": str(config.loop.priority),
         "kernel_realtime": kernel.read_text().strip() if kernel.exists() else "no",
         "clocksource": clocksource.read_text().strip() if clocksource.exists() else "unknown",
-        "watchdogs_written": ", ".join(watchdogs) or "none",
+        "counters": json.dumps(getattr(link, "counters", ())),
     }
 
 
-def _recorder(
-    config: Config, path: Path, robot: Robot, q: np.ndarray, counters: tuple[int, ...], **extra: str
-) -> Recorder:
+def _greeted(config: Config, link: CanLink, lockstep: bool) -> Feedback:
+    listen = 0.0 if lockstep else 1e-3 * config.link.listen_ms
+    return first_feedback(link.handshake(listen=listen, recover=True).q)
+
+
+def _recorder(config: Any, header: Header) -> Recorder:
     log = config.log
     return Recorder.start(
         log.directory,
-        header_of(config, path, robot, q, counters, **extra),
+        header,
         capacity=1 << (round(log.ring_MB * 1e6) - 1).bit_length(),
         segment_s=log.segment_s,
         segment_bytes=round(log.segment_MB * 1e6),
@@ -235,9 +290,9 @@ def _send(link: CanLink, recorder: Recorder, command: Command) -> None:
     recorder.put_many(CAN_TX, link.write(command), time.monotonic_ns())
 
 
-def _summary(servo: Servo, log: Path, dropped: int) -> str:
+def _summary(servo: Servo, faults_seen: tuple[str, ...], log: Path, dropped: int) -> str:
     m = servo.memory
-    seen = ", ".join(faults.names(servo.faults_seen)) or "none"
+    seen = ", ".join(faults_seen) or "none"
     return (
         f"rtctl: {m.state.name} after {m.tick + 1} ticks, {servo.missed} slots missed, faults: {seen}, "
         f"log {log} ({dropped} entries dropped)"
@@ -249,7 +304,6 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
     m, robot = servo.memory, servo.robot
     goal = m.goal
     error, error_rot = servo.errors()
-    stats = recorder.stats()
     return {
         "robot": robot.name,
         "state": m.state.name,
@@ -273,5 +327,30 @@ def status(servo: Servo, recorder: Recorder) -> dict[str, Any]:
         "lateness_s": servo.lateness,
         "compute_s": servo.compute,
         "faults": list(faults.names(m.in_force)),
-        "log": {"path": str(stats.path), "dropped": stats.dropped, "degraded": stats.degraded},
+        "log": _log_status(recorder),
     }
+
+
+def _log_status(recorder: Recorder) -> dict[str, Any]:
+    stats = recorder.stats()
+    return {"path": str(stats.path), "dropped": stats.dropped, "degraded": stats.degraded}
+
+
+ARM_FAMILY = Family(
+    load=cfg.load,
+    build=cfg.build,
+    warm=warm,
+    lock=lambda config: (bus_resource(config.link.interface, config.link.channel), "link.channel"),
+    place=lambda config: f"{config.link.interface}:{config.link.channel}",
+    open=_opened,
+    bounds=lambda robot, link: Bounds(
+        tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
+    ),
+    greet=_greeted,
+    machine=lambda link: ARM,
+    header=lambda config, path, robot, start: header_of(config, path, robot, start.q),
+    status=status,
+    fallback=_fallback,
+    farewell=lambda servo, recorder: _stop_frames(servo.link, servo.robot, recorder),
+    names=faults.names,
+)

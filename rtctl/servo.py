@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,6 +24,17 @@ class Sink(Protocol):
     """Where messages go: the recorder's ring, or a file."""
 
     def put_many(self, kind: int, payloads: list[bytes], time_ns: int) -> bool: ...
+
+
+class Machine(NamedTuple):
+    """The functions in which an arm and a mobile base differ for the loop around the tick; the config chooses."""
+
+    initial: Callable[[Any, Any], Any]  # (robot, feedback) -> memory
+    tick: Callable[[Any, Any, Any, Request], tuple[Any, Any, Record]]
+    news: Callable[[Any, Any, Any, Any], list[tuple[str, str]]]  # (robot, before, after, feedback)
+    harmless: Callable[[Any], Any]  # what a command becomes in a dry run
+    rx: int  # kind of the log's messages
+    tx: int
 
 
 class Turn(NamedTuple):
@@ -55,14 +66,18 @@ class Servo:
         q: np.ndarray,
         dry: bool = False,
         stamp: Callable[[float], int] | None = None,
+        machine: Machine | None = None,
+        start: Any = None,
     ) -> None:
         """`q` (n,) [rad] as the handshake found it; `dry` computes and logs but sends only stop frames.
 
-        `stamp` turns robot time [s] into the log's [ns]; by default it is the monotonic clock.
+        `stamp` turns robot time [s] into the log's [ns]; by default it is the monotonic clock. `machine` and `start`,
+        the first feedback, are an arm's unless others are given.
         """
+        self.machine = ARM if machine is None else machine
         self.robot, self.link, self.sink, self.dry = robot, link, sink, dry
         self.stamp = stamp if stamp is not None else lambda now: time.monotonic_ns()
-        self.memory: Memory = initial(robot, first_feedback(q))
+        self.memory: Memory = self.machine.initial(robot, first_feedback(q) if start is None else start)
         self.digest = hashlib.sha256()
         self.missed = 0
         self.now = 0.0  # [s] robot time of the last slot
@@ -79,15 +94,15 @@ class Servo:
         if self.flags:
             feedback = feedback._replace(link=feedback.link | self.flags)
         before = self.memory
-        self.memory, command, record = tick(self.robot, before, feedback, request)
-        sent = command._replace(drive=Drive.DISABLE) if self.dry else command
+        self.memory, command, record = self.machine.tick(self.robot, before, feedback, request)
+        sent = self.machine.harmless(command) if self.dry else command
         frames = self.link.write(sent)
         self.digest.update(b"".join(frames))
         self.missed += slot.missed
         self.lateness = slot.lateness
         self.faults_seen |= self.memory.in_force
         self.now = now = slot.slot * self.robot.dt
-        news = _news(self.robot, before, self.memory, feedback)
+        news = self.machine.news(self.robot, before, self.memory, feedback)
         self.events += [(now, name, detail) for name, detail in news]
         self._log(feedback, record, frames, request, now, news)
         self.compute = time.perf_counter() - begin
@@ -115,9 +130,9 @@ class Servo:
         stamp = self.stamp(now)
         if request is not QUIET and request != QUIET:
             self.sink.put_many(REQUEST, [encode_request(self.memory.tick, request)], stamp)
-        self.sink.put_many(CAN_RX, self.link.received, stamp)
+        self.sink.put_many(self.machine.rx, self.link.received, stamp)
         self.sink.put_many(TICK, [record.tobytes()], stamp)
-        self.sink.put_many(CAN_TX, frames, stamp)
+        self.sink.put_many(self.machine.tx, frames, stamp)
         if news:
             self.sink.put_many(EVENT, [encode_event(self.memory.tick, now, *each) for each in news], stamp)
 
@@ -135,6 +150,16 @@ def _news(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> li
     if (after.status, after.blocker) != (before.status, before.blocker) and after.status != Status.NO_GOAL:
         news.append((after.status.name.lower(), blocker_name(robot, after)))
     return news
+
+
+ARM = Machine(
+    initial=initial,
+    tick=lambda *given: tick(*given),  # looked up when called
+    news=_news,
+    harmless=lambda command: command._replace(drive=Drive.DISABLE),
+    rx=CAN_RX,
+    tx=CAN_TX,
+)
 
 
 def blocker_name(robot: Robot, m: Memory) -> str:

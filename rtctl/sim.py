@@ -15,6 +15,7 @@ import numpy as np
 from rtctl import config as cfg
 from rtctl.assembly import header_of, link_spec
 from rtctl.config.assets import load_assets
+from rtctl.config.base import is_base
 from rtctl.config.scenario import Scenario, goal_of, load_scenario, robot_file, scenario_dict
 from rtctl.control import faults, task
 from rtctl.control.robot import Robot
@@ -213,6 +214,10 @@ def simulate(
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
     scenario = load_scenario(path)
     where = robot_file(scenario, path)
+    if is_base(where):
+        from rtctl.base_sim import simulate_base  # pymavlink is not needed for an arm
+
+        return simulate_base(scenario, where, str(path), log, realtime)
     config = cfg.load(where)
     robot = cfg.build(config, where)
     start = scenario.start_q_rad

@@ -31,8 +31,8 @@ def edited(*edits: tuple[str, Any]) -> dict[str, Any]:
 SLOW = [("loop.servo_hz", 100), ("loop.model_hz", 100), ("safety.watchdog_ms", 100.0),
         ("safety.stale_hold_ms", 30.0), ("safety.stale_stop_ms", 100.0)]
 FILE = [  # (edits, place, word of the reason): refused from the file alone
-    ([("robot.kind", "base")], "robot.kind", "no mobile base"),
-    ([("link.type", "mavlink")], "link.type", "no MAVLink"),
+    ([("robot.kind", "base")], "robot.kind", "tables of its own"),
+    ([("link.type", "mavlink")], "link.type", "on a bus"),
     ([("link.protocol", "cia402")], "link.protocol", "CiA 402"),
     ([("robot.joints.3.name", "panda_joint1")], "robot.joints[3].name", "joint 0"),
     ([("robot.joints.6.can_id", 1)], "robot.joints[6].can_id", "joint 0"),

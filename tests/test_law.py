@@ -193,8 +193,12 @@ def test_what_the_guards_change_is_the_least_that_keeps_every_bound():
         low, high = -rng.uniform(1.0, 20.0, 7), rng.uniform(1.0, 20.0, 7)
         added, acts = guard(model.A, model.A_inv, tau, low, high, rows, bounds)
         wanted = model.A_inv @ tau
-        best = nearest(model.A, wanted, np.vstack((np.eye(7), -np.eye(7), rows)), np.concatenate((high, -low, bounds)))
-        np.testing.assert_allclose(model.A_inv @ (tau + added), best, atol=0.1)
+        C, b = np.vstack((np.eye(7), -np.eye(7), rows)), np.concatenate((high, -low, bounds))
+        best, found = nearest(model.A, wanted, C, b), model.A_inv @ (tau + added)
+        size = np.sqrt(np.einsum("ci,ij,cj->c", C, model.A_inv, C))
+        cost, least = ((x - wanted) @ model.A @ (x - wanted) for x in (found, best))
+        assert ((C @ found - b) / size).max() <= 1e-3 * np.sqrt(least) + 1e-6
+        assert cost == pytest.approx(least, rel=5e-3, abs=1e-6)
         acted += acts
     assert acted > 90
 

@@ -19,7 +19,7 @@ BRIEF = 2.0  # [s] that is played here of each
 def seen(**changes: Any) -> Seen:
     """Return what a run shows in which nothing is wrong."""
     good: dict[str, Any] = {
-        "robot": "panda", "index": 0, "duration": 5.0, "arrived": True, "error": 0.0, "contact": None, "retreat": 0.0,
+        "robot": "panda", "case": 0, "duration": 5.0, "arrived": True, "error": 0.0, "contact": None, "retreat": 0.0,
         "can_retreat": 0.0, "finite": True, "torque": 1.0, "rate": 1.0, "joint_speed": 1.0, "tip_speed": 1.0,
         "margin": 0.0, "clearance": 0.1, "own": 0.1, "recent_torque": 0.1, "recent_speed": 0.1, "recent_tip": 0.1,
         "stopped": "", "faults": (), "status": "arrived", "detail": "", "statuses": (), "diagnosis": "", "digest": "",
@@ -109,3 +109,14 @@ def test_the_column_run_down_is_no_violation_of_any_bound():
     assert max(run.torque, run.joint_speed, run.tip_speed) <= 1.0
     assert run.rate <= 1.0 + 1e-9
     assert run.margin > 0.0
+
+
+@pytest.mark.parametrize("at", [[0.307, 0.0, 0.44], [0.0, 0.125, 0.62], [0.385, 0.0, 0.55]])
+def test_what_appears_within_the_clearance_of_a_running_arm_makes_nothing_too_fast(at: list[float]):
+    ball = {"name": "ball", "type": "sphere", "radius_m": 0.03, "position_m": at, "appears_s": 0.8}
+    run = play({"robot": "panda", "duration_s": 1.6, "obstacle": [ball]}, 0)
+    assert run.clearance < robot().avoid.rho_min + 0.025  # spheres stand out of the links by that
+    assert run.contact is None
+    assert max(run.torque, run.joint_speed) <= 1.0
+    assert run.tip_speed <= 1.0 + judge.TIP_TOLERANCE
+    assert run.rate <= 1.0 + 1e-9

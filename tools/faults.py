@@ -3,28 +3,32 @@
 import sys
 from pathlib import Path
 
-from rtctl.control.faults import FAULTS
+from rtctl.control.base.faults import FAULTS as BASE_FAULTS
+from rtctl.control.faults import FAULTS, Fault
 
 README = Path(__file__).parents[1] / "README.md"
 BEGIN, END = "<!-- faults: printed by `python -m tools.faults` -->\n", "<!-- end of faults -->"
+BASE_BEGIN, BASE_END = "<!-- faults of a base: printed by `python -m tools.faults` -->\n", "<!-- end of a base's -->"
 
 
-def table() -> str:
-    """Return the fault table as Markdown."""
+def table(faults: tuple[Fault, ...] = FAULTS) -> str:
+    """Return a fault table as Markdown."""
     rows = ["| fault | what it means | reaction | clears |", "|---|---|---|---|"]
-    rows += [f"| `{f.name}` | {f.text} | {f.severity.name} | {f.clear} |" for f in FAULTS]
+    rows += [f"| `{f.name}` | {f.text} | {f.severity.name} | {f.clear} |" for f in faults]
     return "\n".join(rows) + "\n"
 
 
 def with_table(text: str) -> str:
-    """Return README's text with the table between its marks."""
-    head, _, rest = text.partition(BEGIN)
-    _, _, tail = rest.partition(END)
-    return head + BEGIN + "\n" + table() + "\n" + END + tail
+    """Return README's text with the tables between their marks."""
+    for begin, end, faults in ((BEGIN, END, FAULTS), (BASE_BEGIN, BASE_END, BASE_FAULTS)):
+        head, _, rest = text.partition(begin)
+        _, _, tail = rest.partition(end)
+        text = head + begin + "\n" + table(faults) + "\n" + end + tail
+    return text
 
 
 if __name__ == "__main__":
     if "--write" in sys.argv[1:]:
         README.write_text(with_table(README.read_text(encoding="utf-8")), encoding="utf-8")
     else:
-        print(table(), end="")
+        print(table() + "\n" + table(BASE_FAULTS), end="")

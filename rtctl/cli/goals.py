@@ -60,6 +60,8 @@ def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> 
     wanted, begin = message.get("position_m"), time.monotonic()
     while True:
         status = accepted(session.ask({"verb": "status"}))  # made after the goal was taken: never of the one before
+        if wanted is None:  # given in degrees: where that is
+            wanted = status.get("goal_m") or [math.nan] * 3
         why = _end(status, wanted)
         elapsed = time.monotonic() - begin
         if not why and elapsed > timeout:

@@ -40,8 +40,12 @@ def add_after(commands: Commands) -> None:
     schema = command(
         commands, "schema", "print a JSON Schema, for editors", "rtctl schema config > configs/schema.json", _schema
     )
-    schema.add_argument("what", choices=("config", "scenario", "request"), nargs="?", default="config", metavar="WHAT")
-    schema.description = "Print the JSON Schema of WHAT: config (default), scenario, or request to the control socket."
+    schema.add_argument(
+        "what", choices=("config", "base", "scenario", "request"), nargs="?", default="config", metavar="WHAT"
+    )
+    schema.description = (
+        "Print the JSON Schema of WHAT: config (default: an arm's), base, scenario, or request to the control socket."
+    )
     doctor = command(commands, "doctor", "can this machine do it", "rtctl doctor --json", _doctor)
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     doctor.add_argument(
@@ -54,8 +58,11 @@ def add_after(commands: Commands) -> None:
 def _check(arguments: argparse.Namespace) -> int:
     from rtctl import config
 
-    loaded = config.load(arguments.config)
-    report = config.check(loaded, config.build(loaded, arguments.config))
+    if config.is_base(arguments.config):
+        report = config.check_base(arguments.config)
+    else:
+        loaded = config.load(arguments.config)
+        report = config.check(loaded, config.build(loaded, arguments.config))
     print(json.dumps(report.as_dict()) if arguments.json else report.render())
     return EXIT_OK
 
@@ -87,8 +94,8 @@ def _schema(arguments: argparse.Namespace) -> int:
 def _schema_of(what: str) -> dict[str, Any]:
     from rtctl import config
 
-    if what == "config":
-        return config.json_schema()
+    if what in ("config", "base"):
+        return config.json_schema(config.Config if what == "config" else config.BaseConfig)
     import msgspec
 
     from rtctl.config.scenario import Scenario

@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from rtctl.cli.parser import Commands, Parser, add_daemon, command, daemon_of, number, positive
-from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, UsageError
 
 VERBS = {
     "arm": "enable the drives; the arm holds where it is",
@@ -42,7 +42,10 @@ def add(commands: Commands) -> None:
     example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
     goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
-        goal.add_argument(axis, metavar=axis.upper(), type=number, help="in the world frame [m]")
+        goal.add_argument(
+            axis, metavar=axis.upper(), type=number, nargs="?", help="in the world frame [m]; of a base Z means nothing"
+        )
+    goal.add_argument("--latlon", metavar=("LAT", "LON"), nargs=2, type=number, help="of a base instead of X Y [deg]")
     turn = goal.add_mutually_exclusive_group()
     turn.add_argument("--rpy", metavar=("R", "P", "Y"), nargs=3, type=number, help="roll, pitch, yaw [rad]")
     turn.add_argument("--wxyz", metavar=("W", "X", "Y", "Z"), nargs=4, type=number, help="unit quaternion")
@@ -165,9 +168,9 @@ def _goal(arguments: argparse.Namespace) -> int:
     from rtctl.cli.values import letters
     from rtctl.hal.client import Session
 
-    message: dict[str, Any] = {"verb": "goal", "position_m": [arguments.x, arguments.y, arguments.z]}
+    message: dict[str, Any] = {"verb": "goal", **_place(arguments)}
     if arguments.axes == "none":
-        del message["position_m"]
+        message.pop("position_m", None)
     elif arguments.axes is not None:
         message["axes"] = letters(arguments.axes)
     asked = {
@@ -186,6 +189,17 @@ def _goal(arguments: argparse.Namespace) -> int:
         outcome: Outcome = send_and_wait(session, message, arguments.timeout)
     outcome.show(arguments.json)
     return EXIT_OK if outcome.arrived else EXIT_FAILED
+
+
+def _place(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return where a goal is. Raises UsageError."""
+    if arguments.latlon is not None:
+        if arguments.x is not None:
+            raise UsageError("goal: got X Y and --latlon, wanted one of them")
+        return {"latlon_deg": arguments.latlon}
+    if arguments.z is None:  # also of a base: a Z forgotten must not send an arm to the floor
+        raise UsageError("goal: wanted X Y Z, or --latlon LAT LON")
+    return {"position_m": [arguments.x, arguments.y, arguments.z]}
 
 
 def _goals(arguments: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ STATE_STYLE = {
 }
 STATUS_STYLE = {"arrived": "bold green", "moving": "cyan", "no_goal": "dim"}
 NEAR, FAR = 0.03, 0.10  # [m] clearances shown in red and in yellow below
+BASE_SCALE = 10.0  # a base's clearances are that much larger
 BAR = 24  # characters for FULL
 FULL = 0.3  # [m]
 WIDTH = 96  # columns of a status that goes into a file or pipe
@@ -52,7 +53,11 @@ def line(status: dict[str, Any]) -> str:
         f"{status.get('state', '?'):9}",
         f"{status.get('status', '?'):13}",
     ]
-    words += [f"tip {_vector(status.get('x_m'))}", f"error {_mm(status.get('error_m'))}", nearest]
+    words += [
+        f"{'base' if 'vehicle' in status else 'tip'} {_vector(status.get('x_m'))}",
+        f"error {_mm(status.get('error_m'))}",
+        nearest,
+    ]
     words += [str(status.get("detail") or ""), *map(str, status.get("faults") or ())]
     return "  ".join(word for word in words if word)
 
@@ -69,8 +74,11 @@ def render(status: dict[str, Any]) -> RenderableType:
     parts: list[RenderableType] = [head, Text(), _task(status)]
     clearances = status.get("clearance_m") or {}
     if clearances:
-        parts += [Text(), _clearances(clearances)]
-    parts += [Text(), Text(f"joints  {_joints(status.get('q_rad') or ())} deg")]
+        parts += [Text(), _clearances(clearances, BASE_SCALE if "vehicle" in status else 1.0)]
+    if "vehicle" in status:
+        parts += [Text(), Text(f"vehicle {_vehicle(status['vehicle'])}")]
+    else:
+        parts += [Text(), Text(f"joints  {_joints(status.get('q_rad') or ())} deg")]
     faults = status.get("faults") or ()
     parts.append(Text(f"faults  {', '.join(map(str, faults)) or 'none'}", style="bold red" if faults else "dim"))
     log = status.get("log")
@@ -87,7 +95,12 @@ def _task(status: dict[str, Any]) -> Table:
     loop = f"{status.get('tick', '?')}, missed {status.get('missed', '?')}"
     late = "-" if lateness is None else f"{lateness * 1e6:.0f} us late"
     table = Table.grid(padding=(0, 3))
-    table.add_row("tip ", f"{_vector(status.get('x_m'))} m", "time", f"{status.get('time_s') or 0.0:.2f} s")
+    at = f"{_vector(status.get('x_m'))} m"
+    if "vehicle" in status:
+        at += (
+            f", heading {math.degrees(status.get('yaw_rad') or 0.0):+.0f} deg, {status.get('speed_m_s') or 0.0:.2f} m/s"
+        )
+    table.add_row("base" if "vehicle" in status else "tip ", at, "time", f"{status.get('time_s') or 0.0:.2f} s")
     task = status.get("task") or ""
     aim = (
         "none"
@@ -101,7 +114,16 @@ def _task(status: dict[str, Any]) -> Table:
     return table
 
 
-def _clearances(clearances: dict[str, float | None]) -> Table:
+def _vehicle(vehicle: dict[str, Any]) -> str:
+    """Return the autopilot's state: whose it is, and how fresh what it says."""
+    words = ["armed" if vehicle.get("armed") else "disarmed", "ours" if vehicle.get("ours") else "not ours to command"]
+    words += [] if vehicle.get("healthy") else ["position not usable"]
+    ages = (("position", "position_age_s"), ("scan", "scan_age_s"), ("heartbeat", "heartbeat_age_s"))
+    words += [f"{name} {vehicle[key]:.2f} s old" for name, key in ages if vehicle.get(key) is not None]
+    return ", ".join(words)
+
+
+def _clearances(clearances: dict[str, float | None], scale: float = 1.0) -> Table:
     table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="dim")
     table.add_column("obstacle")
     table.add_column("clearance", justify="right", min_width=10)
@@ -111,8 +133,8 @@ def _clearances(clearances: dict[str, float | None]) -> Table:
         if distance is None:
             table.add_row(name, "far", "")
             continue
-        style = "red" if distance < NEAR else "yellow" if distance < FAR else "green"
-        bar = "█" * round(BAR * min(max(distance, 0.0), FULL) / FULL)
+        style = "red" if distance < NEAR * scale else "yellow" if distance < FAR * scale else "green"
+        bar = "█" * round(BAR * min(max(distance, 0.0), FULL * scale) / (FULL * scale))
         table.add_row(name, Text(_mm(distance), style=style), Text(bar, style=style))
     return table
 

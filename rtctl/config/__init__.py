@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from rtctl.config.base import BaseConfig, is_base
+from rtctl.config.base import load as load_base
 from rtctl.config.read import read
 from rtctl.config.rules import bus_load, refuse, scales
 from rtctl.config.structs import Config
@@ -16,7 +18,19 @@ if TYPE_CHECKING:
     from rtctl.config.report import Report
     from rtctl.control.robot import Robot
 
-__all__ = ["Config", "build", "bus_load", "check", "json_schema", "load", "scales"]
+__all__ = [
+    "BaseConfig",
+    "Config",
+    "build",
+    "bus_load",
+    "check",
+    "check_base",
+    "is_base",
+    "json_schema",
+    "load",
+    "load_base",
+    "scales",
+]
 
 
 def load(path: str | Path) -> Config:
@@ -44,8 +58,19 @@ def check(config: Config, robot: "Robot") -> "Report":
     return report(config, robot)
 
 
-def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a config file, from the same structs that check it."""
-    schema = msgspec.json.schema(Config)
+def check_base(path: str | Path) -> "Report":
+    """Return the report of a mobile base's file. Raises ConfigError."""
+    from rtctl.config.base_derive import build as derived
+    from rtctl.config.base_derive import key_of
+    from rtctl.config.base_derive import report as told
+
+    config = load_base(path)
+    key_of(config, path)
+    return told(config, derived(config, path))
+
+
+def json_schema(kind: type = Config) -> dict[str, Any]:
+    """Return the JSON Schema of a config file, from the same structs that check it: an arm's, or `BaseConfig`."""
+    schema = msgspec.json.schema(kind)
     named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rtctl robot config", **schema}
     return dict(msgspec.json.decode(msgspec.json.encode(named)))  # tuples become the lists of JSON

@@ -15,7 +15,7 @@ from rtctl.errors import ConfigError
 from rtctl.types import F64, Shape
 
 Name = Annotated[str, Meta(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
-Coordinate = Annotated[float, Meta(ge=-100.0, le=100.0)]
+Coordinate = Annotated[float, Meta(ge=-9000.0, le=9000.0)]
 Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Extent = Annotated[float, Meta(ge=1e-4, le=50.0)]
 Turn = Annotated[float, Meta(ge=-6.3, le=6.3)]

@@ -64,9 +64,9 @@ def joint_speed(config: Config, i: int) -> float:
 
 def _available(c: Config) -> Iterator[Found]:
     if c.robot.kind != "arm":
-        yield Found("robot.kind", c.robot.kind, "arm; this version drives no mobile base")
+        yield Found("robot.kind", c.robot.kind, "arm; a base has tables of its own")
     if c.link.type != "can":
-        yield Found("link.type", c.link.type, "can; this version has no MAVLink")
+        yield Found("link.type", c.link.type, "can: an arm's drives are on a bus")
     if c.link.protocol == "cia402":
         yield Found("link.protocol", c.link.protocol, "mit or mit+e2e; this version does not speak CiA 402")
 

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from rtctl.config.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.config.obstacles import (
+    Coordinate,
     Name,
     Obstacle,
     Orientation,
@@ -18,7 +19,7 @@ from rtctl.config.obstacles import (
     shape_of,
 )
 from rtctl.config.read import convert, name_place, read
-from rtctl.config.structs import Angles, Key, Table, Text
+from rtctl.config.structs import Angle, Angles, Key, Table, Text
 from rtctl.errors import ConfigError
 from rtctl.types import F64, Goal, ObstacleEdit
 
@@ -60,6 +61,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     robot: Text
     duration_s: Annotated[float, Meta(ge=0.01, le=3600.0)]
     start_q_rad: Angles | None = None  # None: the robot's home
+    start_pose: Annotated[tuple[Coordinate, Coordinate, Angle], Meta(description="of a base: m, m, rad")] | None = None
     seed: Annotated[int, Meta(ge=0, le=2**53)] = 0
     goal: Annotated[tuple[TimedGoal, ...], Meta(max_length=10_000)] = ()
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()

@@ -229,11 +229,12 @@ def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:
 
     A fault with clear rule A stays in force until it was absent for GOOD_TICKS; R and L stay until `cleared`.
     """
-    return _latch(present, latched, good, _AUTOMATIC)
+    return latch_with(present, latched, good, _AUTOMATIC)
 
 
 @njit(cache=True, fastmath=False)
-def _latch(present: int, latched: int, good: I64, automatic: int) -> tuple[int, I64]:
+def latch_with(present: int, latched: int, good: I64, automatic: int) -> tuple[int, I64]:
+    """Return what `latch` does, for a table whose faults in the bits `automatic` clear by themselves."""
     out = good + 1
     in_force = present
     for i in range(good.shape[0]):

@@ -34,8 +34,10 @@ PAIRS = 64  # links near obstacles or links that are guarded at a time
 def may(bound: float, speed: float, jerk: float) -> float:
     """Return the largest acceleration with which `speed` can still be kept below `bound`."""
     gap = bound - speed
-    accel = gap / SPEED_HORIZON
-    return min(accel, np.sqrt(2.0 * jerk * gap)) if gap > 0.0 else accel
+    accel: float = gap / SPEED_HORIZON
+    if gap > 0.0:
+        accel = min(accel, np.sqrt(2.0 * jerk * gap))
+    return accel
 
 
 @njit(cache=True, fastmath=False)
@@ -50,7 +52,8 @@ def may_towards(room: float, speed: float, top: float, braking: float, jerk: flo
     if curve >= top:
         return may(top, speed, jerk)
     slope = braking * min(1.0, max(0.0, speed) / max(curve, SPEED_HORIZON * braking))
-    return may(curve, speed, jerk) - slope
+    accel: float = may(curve, speed, jerk) - slope
+    return accel
 
 
 @njit(cache=True, fastmath=False)

@@ -33,7 +33,10 @@ from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
 OBSTACLES_MAX = 64  # in one camera frame
 CLOUD_MARK = b"RTCLOUD1"
 _LENGTH = struct.Struct("<I")
+ARM_TOLERANCE = 0.1  # [m] of an arm's goal at most
 
+Latitude = Annotated[float, Meta(ge=-85.0, le=85.0)]
+Longitude = Annotated[float, Meta(ge=-180.0, le=180.0)]
 AGE_MAX = 10.0  # [s]
 Age = Annotated[float, Meta(ge=0.0, le=AGE_MAX)]
 Stamp = Annotated[
@@ -74,13 +77,14 @@ class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
     """Move the tip: position (or `axes` of it), orientation, direction of a tool axis; the rest stays free."""
 
     position_m: Place | None = None
+    latlon_deg: tuple[Latitude, Longitude] | None = None  # of a base that knows where on Earth it is
     axes: Axes | None = None
     wxyz: Orientation | None = None
     rpy_rad: RollPitchYaw | None = None
     hold: Literal["orientation"] | None = None
     direction: Direction | None = None
     tool_axis: ToolAxis | None = None
-    tolerance_m: Annotated[float, Meta(ge=1e-4, le=0.1)] | None = None
+    tolerance_m: Annotated[float, Meta(ge=1e-4, le=10.0)] | None = None  # of an arm at most 0.1
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
 
 
@@ -137,6 +141,7 @@ class Bounds(NamedTuple):
     tolerance: float  # [m]
     tolerance_rot: float  # [rad]
     axes: Task = Task.POSE  # of the tip that the arm can move
+    local: Callable[[float, float], tuple[float, float] | None] | None = None  # a place [deg] in [m]; None: an arm
 
 
 def cloud_message(header: dict[str, Any], steps: bytes) -> bytes:
@@ -251,6 +256,10 @@ def _age(message: ObstacleMessage | ObstaclesMessage | CloudMessage, now: float)
 
 
 def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Goal:
+    if message.latlon_deg is not None:
+        message = msgspec.structs.replace(message, position_m=_position_of(message, bounds), latlon_deg=None)
+    if bounds.local is None and (message.tolerance_m or 0.0) > ARM_TOLERANCE:
+        raise RequestError(f"goal.tolerance_m: got {message.tolerance_m}, wanted at most {ARM_TOLERANCE}")
     if found := goal_contradiction(message):
         key, got, wanted = found
         raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
@@ -263,6 +272,19 @@ def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Seq
     if away > bounds.radius:
         raise RequestError(f"goal.position_m: got {away:.3f} m from the base, wanted at most {bounds.radius:.3f} m")
     return goal
+
+
+def _position_of(message: GoalMessage, bounds: Bounds) -> tuple[float, float, float]:
+    """Return the place [m] of a goal in degrees. Raises RequestError."""
+    assert message.latlon_deg is not None
+    if message.position_m is not None:
+        raise RequestError("goal.latlon_deg: got position_m beside it, wanted one of them")
+    if bounds.local is None:
+        raise RequestError("goal.latlon_deg: an arm has no place on Earth, wanted position_m")
+    at = bounds.local(*message.latlon_deg)
+    if at is None:
+        raise RequestError("goal.latlon_deg: the vehicle has not said where its origin is")
+    return (*at, 0.0)
 
 
 def _obstacles(message: Message) -> Iterator[tuple[str, Obstacle]]:

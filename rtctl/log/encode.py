@@ -214,6 +214,8 @@ class Encoder:
             channel = self._can_id[kind >> 8]
             block = self._frames(payloads, base, channel, min(data, size - 8), stamp, time, sequence)
             parts = [(channel, 0)]
+        elif base in (Kind.MAV_TX, Kind.MAV_RX) and kind >> 8 < len(self.header.links):
+            return self._packets(kind, rows, payloads, time, sequence, pieces)
         elif kind in (Kind.EVENT, Kind.REQUEST):
             return self._texts(kind, rows, payloads, stamp, sequence, pieces)
         else:
@@ -265,6 +267,18 @@ class Encoder:
         if size:
             body["data"] = frame["data"][:, :size]
         return block
+
+    def _packets(
+        self, kind: int, rows: I64, payloads: list[Payload], time: I64, sequence: I64, pieces: list[Payload]
+    ) -> list[tuple[I64, int, I64, I64, int]]:
+        """MAVLink packets, one by one: there are hundreds a second, of many sizes."""
+        way = "tx" if kind & 0xFF == Kind.MAV_TX else "rx"
+        channel = self._id[schema.mavlink_topic(self.header.links[kind >> 8], way)]
+        stamps, sequences = time.tolist(), sequence.tolist()
+        for number, row in enumerate(rows.tolist()):
+            data = schema.mavlink_message(bytes(payloads[number]), stamps[number])
+            pieces[row] = message(channel, sequences[number], stamps[number] + self.offset, data)
+        return [(rows, channel, time + self.offset, sequence, 0)]
 
     def _texts(
         self, kind: int, rows: I64, payloads: list[Payload], stamp: I64, sequence: I64, pieces: list[Payload]

@@ -15,6 +15,8 @@ class Kind(IntEnum):
     EVENT = 4  # a JSON object, UTF-8
     REQUEST = 5  # JSON of `replay.encode_request`
     SENTINEL = 6  # JSON: why the producer closes the log
+    MAV_TX = 7  # one MAVLink packet; add `link << 8` for the link of that index in `Header.links`
+    MAV_RX = 8
 
 
 _RX = int(Kind.CAN_RX)  # comparing with the enum's member takes longer than a put should

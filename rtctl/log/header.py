@@ -15,7 +15,19 @@ import numpy as np
 from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
 
-PACKAGES = ("rtctl", "numpy", "numba", "pin", "coal", "mcap", "protobuf", "zstandard", "python-can", "pybullet")
+PACKAGES = (
+    "rtctl",
+    "numpy",
+    "numba",
+    "pin",
+    "coal",
+    "mcap",
+    "protobuf",
+    "zstandard",
+    "python-can",
+    "pybullet",
+    "pymavlink",
+)
 
 SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing
 
@@ -38,6 +50,7 @@ class Header(NamedTuple):
     revision: str  # of the program's own repository, "" when it does not run from one
     extra: Mapping[str, str]  # handshake values, realtime settings, ...
     files: Mapping[str, str | bytes]  # further attachments by name (scenario, DBC, meshes)
+    links: tuple[str, ...] = ()  # MAVLink; an entry's `kind >> 8` is the index
 
     @property
     def config_sha256(self) -> str:
@@ -124,7 +137,10 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
     Raises ValueError, TypeError or KeyError on anything else.
     """
     fields = [(str(f[0]), str(f[1]), tuple(f[2])) if len(f) > 2 else (str(f[0]), str(f[1])) for f in json.loads(text)]
-    dtype = np.dtype(fields)
+    try:
+        dtype = np.dtype(fields)
+    except SyntaxError as error:  # numpy evaluates what stands between commas
+        raise ValueError(f"no format of numpy: {error}") from None
     if unknown := {f.base.str for f in (dtype[name] for name in dtype.names or ())} - FIXED:
         raise ValueError(f"types {sorted(unknown)}, wanted some of {sorted(FIXED)}")
     return dtype
@@ -168,4 +184,5 @@ def header_from_json(text: str) -> Header:
         revision=str(raw["revision"]),
         extra={str(k): str(v) for k, v in raw["extra"].items()},
         files={str(k): _from_text(v) for k, v in raw["files"].items()},
+        links=tuple(map(str, raw.get("links", ()))),
     )

@@ -5,6 +5,7 @@ a thousand messages is then one copy of the template and one numpy assignment pe
 """
 
 import json
+import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -272,6 +273,9 @@ def channels(header: Header) -> tuple[Channel, ...]:
         (SCENE, "protobuf", "foxglove.SceneUpdate", "protobuf", descriptor_set(SceneUpdate.DESCRIPTOR)),
     ]
     rows += [(can_topic(bus), "protobuf", "rtctl.CanFrame", "protobuf", can) for bus in header.buses]
+    for link in header.links:
+        packet = mavlink_descriptor()
+        rows += [(mavlink_topic(link, way), "protobuf", MAVLINK, "protobuf", packet) for way in ("rx", "tx")]
     return tuple(Channel(number, *row) for number, row in enumerate(rows, start=1))
 
 
@@ -295,3 +299,42 @@ def descriptor_set(message: Any) -> bytes:
 def can_topic(bus: str) -> str:
     """Return the topic of a bus."""
     return f"/can/{bus}"
+
+
+MAVLINK = "rtctl.MavlinkPacket"
+_MAVLINK = (("stamp_ns", "FIXED64", "<u8"), ("id", "FIXED32", "<u4"), ("system", "FIXED32", "<u4"),
+            ("component", "FIXED32", "<u4"), ("sequence", "FIXED32", "<u4"))  # fmt: skip
+_MAVLINK_HEAD = struct.Struct("<BQBIBIBIBIB")  # tags and values of the above, then the tag of the packet's bytes
+
+
+def mavlink_descriptor() -> bytes:
+    """Return the serialized FileDescriptorSet of `rtctl.MavlinkPacket`: a packet's bytes, and what its header says."""
+    message = DescriptorProto(name="MavlinkPacket")
+    optional = FieldDescriptorProto.LABEL_OPTIONAL
+    for number, (name, kind, _) in enumerate(_MAVLINK, start=1):
+        message.field.add(name=name, number=number, type=getattr(FieldDescriptorProto, f"TYPE_{kind}"), label=optional)
+    message.field.add(name="data", number=6, type=FieldDescriptorProto.TYPE_BYTES, label=optional)
+    return _file("rtctl/mavlink_packet.proto", message)
+
+
+def mavlink_message(raw: bytes, stamp: int) -> bytes:
+    """Return an `rtctl.MavlinkPacket` of a packet that came or went at monotonic time `stamp` [ns]."""
+    if raw[:1] == b"\xfd" and len(raw) >= 12:
+        sequence, system, component, number = raw[4], raw[5], raw[6], int.from_bytes(raw[7:10], "little")
+    elif raw[:1] == b"\xfe" and len(raw) >= 8:
+        sequence, system, component, number = raw[2], raw[3], raw[4], raw[5]
+    else:
+        sequence = system = component = number = 0
+    head = _MAVLINK_HEAD.pack(0x09, stamp, 0x15, number, 0x1D, system, 0x25, component, 0x2D, sequence, 0x32)
+    return head + _varint(len(raw)) + raw
+
+
+def mavlink_packet(data: bytes) -> bytes:
+    """Return the packet's bytes in a message that `mavlink_message` made."""
+    at = _MAVLINK_HEAD.size
+    return data[at + (1 if data[at] < 0x80 else 2) :]
+
+
+def mavlink_topic(link: str, way: str) -> str:
+    """Return the topic of a link's direction, `rx` or `tx`."""
+    return f"/mavlink/{link}/{way}"

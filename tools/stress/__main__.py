@@ -100,7 +100,7 @@ def _tell(result: Result, verbose: bool) -> None:
     if verbose or broken:
         end = "arrived" if seen.arrived else f"{outcome(seen)} {seen.detail} {1e3 * seen.error:.0f} mm short"
         line = (
-            f"{seen.robot}:{seen.index} {end}; clearance {1e3 * seen.clearance:.0f} mm, tau {seen.torque:.2f}, "
+            f"{seen.robot}:{seen.case} {end}; clearance {1e3 * seen.clearance:.0f} mm, tau {seen.torque:.2f}, "
             f"speed {seen.joint_speed:.3f}, tip {seen.tip_speed:.3f}, margin {seen.margin:.3f}"
         )
         print(line + "".join(f"\n    FAILED: {b}" for b in broken), flush=True)
@@ -111,8 +111,8 @@ def _saved(result: Result, seed: int, folder: Path) -> Path:
     seen, broken = result
     robot, config = robot_of(seen.robot)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{seen.robot}_{seed}_{seen.index}.toml"
-    path.write_text(toml_of(scenario_of(robot, config, seed, seen.index), "; ".join(broken)), encoding="utf-8")
+    path = folder / f"{seen.robot}_{seed}_{seen.case}.toml"
+    path.write_text(toml_of(scenario_of(robot, config, seed, seen.case), "; ".join(broken)), encoding="utf-8")
     return path
 
 

@@ -31,7 +31,7 @@ class Seen(NamedTuple):
     """What an oracle saw of one run, up to its first contact."""
 
     robot: str
-    index: int
+    case: int  # index of the scenario
     duration: float  # [s] played
     arrived: bool
     error: float  # [m] at the end
@@ -162,7 +162,7 @@ def _seen(servo: Servo, watch: Watch, name: str, index: int) -> Seen:
     arrived = bool(figures["arrived"])
     wrong = "" if arrived or contact is not None else diagnosis(servo, watch, status, detail)
     return Seen(
-        robot=name, index=index, duration=watch.ticks * robot.dt, arrived=arrived,
+        robot=name, case=index, duration=watch.ticks * robot.dt, arrived=arrived,
         error=figures["final_error_m"] if figures["final_error_m"] is not None else np.inf,
         contact=contact, retreat=retreat, can_retreat=can, finite=watch.finite,
         torque=figures["max_torque_ratio"], rate=figures["max_torque_rate_ratio"],

@@ -7,8 +7,8 @@ stand out of them by up to 25 mm:
 - the goal is the tip's pose at a second configuration outside the joint-limit zones, clear of itself likewise;
 - a still obstacle keeps rho >= influence from both;
 - a moving one, at up to half of v_max, keeps rho >= influence + the look-ahead's widening from the start as long as it
-  takes to arm the robot and 0.5 s more, from the goal's configuration at the end, and always from the column, those
-  spheres that no posture takes anywhere. It may cross anything else.
+  takes to arm the robot and 0.5 s more, from the goal when it is given, from the goal's configuration at the end, and
+  always from the column, those spheres that no posture takes anywhere. It may cross anything else.
 """
 
 from collections.abc import Callable
@@ -108,6 +108,7 @@ def _obstacle(robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: 
     """Return an obstacle that leaves the arm a chance, None when none was found."""
     scale = robot.reach / 0.9
     at_start, at_end = _points(robot, start), _points(robot, end)
+    goal = robot.body.evaluate(end, np.zeros(robot.n), robot.points, robot.own).x[None]
     _ROBOTS[robot.name] = robot
     for _ in range(TRIES):
         kind = str(rng.choice(KINDS))
@@ -126,12 +127,12 @@ def _obstacle(robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: 
             if kind not in ("plane", "sphere", "point") and rng.random() < 0.3:
                 table["omega_rad_s"] = _round(rng.uniform(-0.5, 0.5, 3))
         table["position_m"] = _round(where)
-        if _leaves_a_chance(robot, table, at_start, at_end, lasts if moving else 0.0):
+        if _leaves_a_chance(robot, table, at_start, at_end, goal, lasts if moving else 0.0):
             return table
     return None
 
 
-def _leaves_a_chance(robot: Robot, table: Table, at_start: F64, at_end: F64, lasts: float) -> bool:
+def _leaves_a_chance(robot: Robot, table: Table, at_start: F64, at_end: F64, goal: F64, lasts: float) -> bool:
     """Return whether an obstacle keeps the rule above; lasts [s] is how long it moves, 0 for a still one."""
     if np.abs(table["position_m"]).max() > 50.0:
         return False
@@ -150,6 +151,8 @@ def _leaves_a_chance(robot: Robot, table: Table, at_start: F64, at_end: F64, las
     if not clear(at_end, lasts, wide):
         return False
     if not all(clear(at_start, float(t), wide) for t in np.linspace(0.0, GRACE, 6)):
+        return False
+    if not clear(goal, GOAL_AT, rho0, np.zeros(1)):
         return False
     centres, radius = _column(robot.name)
     return all(clear(centres, float(t), wide, radius) for t in np.linspace(0.0, lasts, 25))

@@ -1,0 +1,190 @@
+"""`rtctl sim` of a mobile base: the daemon's own servo and link on MAVLink bytes, the virtual rover in lockstep."""
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtctl.base import header_of, machine_of, open_link
+from rtctl.config.base import load
+from rtctl.config.base_derive import build
+from rtctl.config.scenario import Scenario, goal_of
+from rtctl.control.base import faults
+from rtctl.control.base.memory import BaseMemory
+from rtctl.control.base.robot import Base
+from rtctl.errors import ConfigError
+from rtctl.hal.clock import lockstep
+from rtctl.hal.wire import InProcess
+from rtctl.servo import Servo
+from rtctl.types import F64, Goal, Request, State, Verb
+
+ARM_TIME = 5.0  # [s] within which the vehicle must be running
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+SHOWN = frozenset(("state", "fault", "vehicle"))  # events that are no statuses
+
+
+class Leg(NamedTuple):
+    """One goal on its way."""
+
+    goal: Goal
+    at: float  # [s]
+    start: F64  # (2,) [m]
+    reached: float = -1.0  # [s] since when the base has stayed within the tolerance, -1: not now
+    deviation: float = 0.0  # [m] from the straight line
+    error: float = np.inf  # [m]
+
+
+class Tally:
+    """Figures of a run, from the truth of each period."""
+
+    def __init__(self) -> None:
+        self.legs: list[Leg] = []
+        self.path = self.speed = 0.0
+        self.clearance: dict[str, float] = {}
+        self.contacts = 0
+        self.track: list[tuple[float, float, float, float, float]] = []  # t, x, y, yaw, v
+        self._at: F64 | None = None
+
+    def add(self, truth: Any, keep: bool) -> None:
+        """Take one period into account."""
+        at = np.array([truth.x, truth.y])
+        if self._at is not None:
+            self.path += float(np.hypot(*(at - self._at)))
+        self._at = at
+        self.speed, self.contacts = max(self.speed, abs(truth.v)), truth.contacts
+        if keep:
+            self.track.append((truth.time, truth.x, truth.y, truth.yaw, truth.v))
+        for name, d in truth.clearance.items():
+            self.clearance[name] = min(d, self.clearance.get(name, np.inf))
+        if self.legs:
+            self.legs[-1] = _advanced(self.legs[-1], at, truth.time)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures under their published names."""
+        goals = [
+            {
+                "at_s": _r(leg.at),
+                "arrived": leg.reached >= 0.0,
+                "time_to_goal_s": _r(leg.reached - leg.at) if leg.reached >= 0.0 else None,
+                "error_m": _r(leg.error),
+                "line_deviation_m": _r(leg.deviation),
+            }
+            for leg in self.legs
+        ]
+        return {
+            "arrived": bool(self.legs) and all(leg.reached >= 0.0 for leg in self.legs),
+            "time_to_goal_s": goals[-1]["time_to_goal_s"] if goals else None,
+            "final_error_m": _r(self.legs[-1].error) if self.legs else None,
+            "path_length_m": _r(self.path),
+            "line_deviation_m": _r(max((leg.deviation for leg in self.legs), default=0.0)),
+            "max_speed_m_s": _r(self.speed),
+            "min_clearance_m": {
+                "all": _r(min(self.clearance.values())) if self.clearance else None,
+                **{name: _r(d) for name, d in self.clearance.items()},
+            },
+            "contacts": self.contacts,
+            "goals": goals,
+        }
+
+
+def _r(value: float) -> float | None:
+    return float(f"{value:.9g}") if np.isfinite(value) else None
+
+
+def _advanced(leg: Leg, at: F64, now: float) -> Leg:
+    e = float(np.hypot(*(leg.goal.position[:2] - at)))
+    along = leg.goal.position[:2] - leg.start
+    length = float(np.hypot(*along))
+    offset = at - leg.start
+    if length > 1e-9:
+        offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
+    reached = (leg.reached if leg.reached >= 0.0 else now) if e <= leg.goal.tolerance else -1.0
+    return leg._replace(reached=reached, deviation=max(leg.deviation, float(np.hypot(*offset))), error=e)
+
+
+class Feed:
+    """What the controller is told and when: arming, and the scenario's goals. Obstacles its sensor must see."""
+
+    def __init__(self, base: Base, scenario: Scenario, tally: Tally) -> None:
+        self.base, self.tally = base, tally
+        self.pending = list(scenario.goal)
+        self.waiting: tuple[Goal, float, F64] | None = None
+
+    def request(self, m: BaseMemory, truth: Any) -> Request:
+        """Return the request of this period."""
+        if self.waiting is not None and not m.verdict:
+            self.tally.legs.append(Leg(*self.waiting))
+        self.waiting = None
+        verb = Verb.ARM if m.state == State.IDLE and m.tick < 0 else Verb.NONE
+        goal = None
+        if self.pending and truth.time >= self.pending[0].at_s and m.state == State.RUN:
+            goal = goal_of(self.pending.pop(0), UPRIGHT, self.base.tolerance, 0.1)
+            self.waiting = (goal, truth.time, np.array([truth.x, truth.y]))
+        return Request(verb, goal)
+
+
+def simulate_base(
+    scenario: Scenario, where: Path, source: str, log: str | Path | None, realtime: bool, track: bool = False
+) -> dict[str, Any]:
+    """Return the figures of a scenario of the base whose config is `where`; `track` adds where it went."""
+    from rtctl.sim import open_simulator
+
+    config = load(where)
+    base = build(config, where)
+    if scenario.start_q_rad is not None:
+        raise ConfigError(f"{source}: start_q_rad", "angles", "nothing: a base has start_pose")
+    rover: Any = open_simulator(where, scenario, source)
+    link = open_link(config, where, InProcess(rover.exchange, base.dt))
+    sink = None
+    try:
+        start = link.handshake()
+        if log is not None:
+            from rtctl.log.writer import McapSink
+
+            sink = McapSink(Path(log), header_of(config, where, base, start))
+        machine = machine_of(link)
+        robot: Any = base
+        bytes_link: Any = link
+        servo = Servo(
+            robot, bytes_link, sink, np.zeros(0), stamp=lambda now: round(now * 1e9), machine=machine, start=start
+        )
+        tally = Tally()
+        begun = time.perf_counter()
+        ticks = _play(servo, scenario, rover, tally, realtime, track)
+        elapsed = time.perf_counter() - begun
+    finally:
+        if sink is not None:
+            sink.close("end")
+        link.close()
+    figures = {
+        **tally.figures(),
+        "statuses": [[_r(t), name, detail] for t, name, detail in servo.events if name not in SHOWN],
+        "vehicle": [[_r(t), detail] for t, name, detail in servo.events if name == "vehicle"],
+        "mode_final": servo.memory.state.name,
+        "faults": list(faults.names(servo.faults_seen)),
+        "ticks": ticks,
+        "missed": servo.missed,
+        "realtime_factor": _r(ticks * base.dt / elapsed),
+        "digest": servo.digest.hexdigest(),
+    }
+    return figures | ({"track": tally.track} if track else {})
+
+
+def _play(servo: Servo, scenario: Scenario, rover: Any, tally: Tally, realtime: bool, track: bool) -> int:
+    """Run the servo in lockstep until the scenario is over; return the ticks it took."""
+    base: Any = servo.robot
+    memory: Any = servo.memory
+    feed = Feed(base, scenario, tally)
+    ticks, begun = 0, time.monotonic()
+    for slot in lockstep():
+        truth = rover.truth()
+        if truth.time >= scenario.duration_s or slot.slot * base.dt > scenario.duration_s + ARM_TIME:
+            break
+        memory = servo.memory
+        servo.turn(slot, feed.request(memory, truth))
+        tally.add(rover.truth(), track)
+        ticks += 1
+        if realtime:
+            time.sleep(max(0.0, begun + ticks * base.dt - time.monotonic()))
+    return ticks

@@ -1,0 +1,111 @@
+"""`rtctl run` of a base against the rover double, as two processes over UDP in real time."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+from rtctl import cli
+from rtctl.errors import EXIT_OK
+from rtctl.hal.client import demand
+from rtctl.log import read
+from tests.base_lab import CONFIGS, ROVER
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Pair:
+    """The double and, one after another, daemons that drive it."""
+
+    def __init__(self, folder):
+        self.folder, self.console, self.report = folder, str(folder / "console" / "s"), folder / "report.json"
+        text = ROVER.read_text().replace("127.0.0.1:14550", f"127.0.0.1:{free_port()}")
+        text = text.replace('directory = "logs"', f'directory = "{folder / "logs"}"')
+        text = text.replace("disk_floor_MB = 500.0", "disk_floor_MB = 1.0")
+        self.config = folder / "rover.toml"
+        self.config.write_text(text + f'\n[console]\nsocket = "{self.console}"\n')
+        self.processes = []
+        scenario = CONFIGS / "worlds" / "disc.toml"
+        self.double = self._start("firmware_sim", self.config, "--scenario", scenario, "--report", self.report)
+        assert self.double.stdout.readline().startswith("rover ready on udp")
+
+    def _start(self, *command):
+        process = subprocess.Popen([sys.executable, "-m", *map(str, command)], stdout=subprocess.PIPE, text=True)
+        self.processes.append(process)
+        return process
+
+    def daemon(self):
+        process = self._start("rtctl", "run", self.config)
+        for line in process.stdout:
+            if line.startswith("rtctl: ready"):
+                return process
+        raise AssertionError(process.wait())
+
+    def ask(self, verb, **keys):
+        return demand(self.console, {"verb": verb, **keys}, 5.0)
+
+    def until(self, condition, seconds=15.0):
+        end = time.monotonic() + seconds
+        while not condition(self.ask("status")):
+            assert time.monotonic() < end, self.ask("status")
+            time.sleep(0.05)
+
+    def truth(self):
+        return json.loads(self.report.read_text())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in self.processes:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+
+
+def test_a_base_is_armed_driven_by_metres_and_degrees_and_let_go_at_rest(tmp_path, capsys):
+    with Pair(tmp_path) as pair:
+        daemon = pair.daemon()
+        assert not pair.truth()["armed"]
+        pair.ask("arm")
+        pair.until(lambda s: s["state"] == "RUN")
+        options = ["--socket", pair.console, "--wait", "--json"]
+        assert cli.main(["goal", "3", "0.5", "0", *options]) == EXIT_OK
+        assert cli.main(["goal", "--latlon", "-35.363262", "149.165281", *options]) == EXIT_OK  # 4 m east of the origin
+        for line in capsys.readouterr().out.splitlines():
+            assert json.loads(line)["arrived"]
+        assert abs(pair.ask("status")["x_m"][0] - 4.0) < 0.4
+        assert cli.main(["goal", "1", "0", "0", "--rpy", "0", "0", "1", "--socket", pair.console]) != EXIT_OK
+        assert "orientation" in capsys.readouterr().err
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(15.0) == EXIT_OK
+        time.sleep(0.7)
+        truth = pair.truth()
+        assert (truth["armed"], truth["contacts"], truth["aborted"]) == (False, 0, "")
+        assert abs(truth["v_m_s"]) < 0.05
+        (path,) = (tmp_path / "logs").glob("*.mcap")
+        log = read(path)
+        assert log.complete
+        assert len(log["/mavlink/vehicle/rx"]) > 300
+        assert len(log["/tick"]) == log["/tick"].array["tick"][-1] + 1
+
+
+def test_a_daemon_that_is_killed_leaves_a_vehicle_that_stops_by_itself(tmp_path):
+    with Pair(tmp_path) as pair:
+        daemon = pair.daemon()
+        pair.ask("arm")
+        pair.until(lambda s: s["state"] == "RUN")
+        pair.ask("goal", position_m=[15.0, -6.0, 0.0])
+        pair.until(lambda s: s["speed_m_s"] > 1.0)
+        os.kill(daemon.pid, signal.SIGKILL)
+        time.sleep(6.0)
+        truth = pair.truth()
+        assert abs(truth["v_m_s"]) < 0.1
+        assert truth["contacts"] == 0

@@ -1,0 +1,165 @@
+"""MAVLink 2 signing, rows 58 to 60: judged before anything parses, against two other implementations."""
+
+import os
+import stat
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pamoja import mavlink as pamoja
+
+from rtctl.config.base import read_key
+from rtctl.errors import ConfigError
+from rtctl.hal.mavlink import dialect
+from rtctl.hal.mavlink_keys import LEASE, Keys
+from rtctl.protocol import signing
+from rtctl.protocol.signing import NOTHING, State, Verdict
+
+KEY = bytes(range(32))
+UNIX = 1_790_000_000 * 10**9  # [ns]
+NOW = signing.timestamp(UNIX)
+EXTRA = dialect.MAVLink_attitude_message.crc_extra
+
+
+def attitude(system: int = 1) -> bytes:
+    """Return an unsigned frame."""
+    mav = dialect.MAVLink(None, srcSystem=system, srcComponent=1)
+    return bytes(mav.attitude_encode(1000, 0.1, 0.2, 0.3, 0.0, 0.0, 0.1).pack(mav))
+
+
+def signed(stamp: int = NOW, link: int = 0, key: bytes = KEY, system: int = 1) -> signing.Frame:
+    raw, _ = signing.sign(attitude(system), key, link, State({}, stamp - 1), 0, EXTRA)
+    return cut(raw)
+
+
+def cut(raw: bytes) -> signing.Frame:
+    frames, rest, junk = signing.split(raw)
+    assert (len(frames), rest, junk) == (1, b"", 0)
+    return frames[0]
+
+
+def test_what_another_implementation_signs_is_good_and_the_other_way_round():
+    stamp = pamoja.timestamp_from_unix_micros(UNIX // 1000)
+    assert stamp == NOW
+    header = pamoja.MavlinkHeader(sequence=3, system_id=1, component_id=1)
+    frame = cut(pamoja.MavlinkSigner(KEY, 0, NOW).sign(header, 30, attitude()[10:-2], EXTRA).bytes)
+    assert signing.verify(frame, KEY, NOTHING, NOW)[0] == Verdict.GOOD
+    ours = pamoja.MavlinkFrame.parse_known(signed().raw)
+    assert ours.signed
+    pamoja.MavlinkVerifier(KEY).verify(ours)  # raises when it is not
+    theirs = dialect.MAVLink(None)
+    theirs.signing.secret_key, theirs.signing.allow_unsigned_callback = KEY, None
+    assert theirs.parse_buffer(signed().raw)[0].get_type() == "ATTITUDE"
+
+
+def test_the_checksum_is_that_of_another_implementation():
+    for data in (b"", b"\x00", bytes(range(256))):
+        assert signing.crc(data) == pamoja.mavlink_crc16_mcrf4xx(data)
+
+
+def test_unsigned_version_1_and_unknown_flags_are_refused_under_a_key():
+    assert signing.verify(cut(attitude()), KEY, NOTHING, NOW)[0] == Verdict.UNSIGNED
+    old = b"\xfe\x02\x00\x01\x01\x00ab\x00\x00"
+    assert signing.verify(cut(old), KEY, NOTHING, NOW)[0] == Verdict.OLD_PROTOCOL
+    raw = bytearray(attitude())
+    raw[2] = 0x02
+    assert signing.verify(cut(bytes(raw)), KEY, NOTHING, NOW)[0] == Verdict.MALFORMED
+
+
+def test_one_forged_frame_with_a_maximal_stamp_does_not_lock_the_genuine_stream_out():
+    _, state = signing.verify(signed(NOW), KEY, NOTHING, NOW)
+    forged = signed((1 << 48) - 1, key=bytes(32))
+    verdict, after = signing.verify(forged, KEY, state, NOW)
+    assert verdict == Verdict.FORGED
+    assert after == state
+    assert signing.verify(signed(NOW + 1), KEY, after, NOW)[0] == Verdict.GOOD
+
+
+@given(st.integers(0, 59), st.integers(1, 255))
+def test_any_changed_byte_is_a_forgery(at, by):
+    raw = bytearray(signed().raw)
+    at %= len(raw)
+    raw[at] ^= by
+    frames, _, _ = signing.split(bytes(raw))
+    for frame in frames:
+        assert signing.verify(frame, KEY, NOTHING, NOW)[0] != Verdict.GOOD
+
+
+def test_a_replay_is_refused_also_after_a_restart_and_after_a_kill(tmp_path):
+    path = tmp_path / "stamps"
+    clock = iter(range(UNIX, UNIX + 10**12, 10**7))
+    keys = Keys(KEY, path, unix_ns=lambda: next(clock))
+    first, second = signed(NOW), signed(NOW + 5)
+    assert [keys.judge(f) for f in (first, second, first, second)] == [Verdict.GOOD] * 2 + [Verdict.REPLAYED] * 2
+    keys.keep()  # and then kill -9: what is on the disk is a lease
+    again = Keys(KEY, path, unix_ns=lambda: next(clock))
+    assert again.judge(first) == again.judge(second) == Verdict.REPLAYED
+    assert again.judge(signed(NOW + 5 + LEASE)) == Verdict.REPLAYED  # could have been heard before the kill
+    assert again.judge(signed(NOW + 6 + LEASE)) == Verdict.GOOD
+    again.keep(last=True)
+    assert Keys(KEY, path, unix_ns=lambda: next(clock)).judge(signed(NOW + 7 + LEASE)) == Verdict.GOOD
+    assert stat.S_IMODE(os.stat(path).st_mode) == 0o600
+
+
+def test_our_own_stamps_rise_over_a_restart_with_a_clock_that_went_back(tmp_path):
+    first = Keys(KEY, tmp_path / "s", unix_ns=lambda: UNIX)
+    sent = [cut(first.signed(attitude(), EXTRA)) for _ in range(3)]
+    first.keep()
+    second = Keys(KEY, tmp_path / "s", unix_ns=lambda: UNIX - 10**12)
+    sent.append(cut(second.signed(attitude(), EXTRA)))
+    stamps = [int.from_bytes(f.raw[-12:-6], "little") for f in sent]
+    assert stamps == sorted(set(stamps))
+
+
+def test_streams_are_told_apart_bounded_and_not_taken_when_a_minute_behind():
+    state = NOTHING
+    for link in range(signing.STREAMS):
+        verdict, state = signing.verify(signed(link=link), KEY, state, NOW)
+        assert verdict == Verdict.GOOD
+    assert signing.verify(signed(link=99), KEY, state, NOW)[0] == Verdict.CROWDED
+    minute = signing.NEW_STREAM
+    assert signing.verify(signed(NOW - minute), KEY, NOTHING, NOW)[0] == Verdict.GOOD
+    assert signing.verify(signed(NOW - minute - 1), KEY, NOTHING, NOW)[0] == Verdict.STALE
+
+
+@given(st.lists(st.binary(max_size=60), max_size=6))
+def test_no_bytes_make_it_raise_and_none_are_good(chunks):
+    rest, state = b"", NOTHING
+    for chunk in chunks:
+        frames, rest, _ = signing.split(rest + chunk)
+        for frame in frames:
+            verdict, after = signing.verify(frame, KEY, state, NOW)
+            assert verdict != Verdict.GOOD
+            assert after is state
+
+
+@given(
+    st.lists(st.integers(1, 30), min_size=1, max_size=12), st.binary(max_size=5).filter(lambda b: not b.strip(b"\0"))
+)
+def test_frames_are_cut_alike_however_the_bytes_are_split(sizes, noise):
+    data = noise + b"".join(signed(NOW + k).raw for k in range(3))
+    rest, found, at = b"", [], 0
+    for size in [*sizes, len(data)]:
+        frames, rest, _ = signing.split(rest + data[at : at + size])
+        found += [f.raw for f in frames]
+        at += size
+    assert found == [signed(NOW + k).raw for k in range(3)]
+
+
+def test_a_key_file_is_for_its_owner_alone(tmp_path):
+    path = tmp_path / "key"
+    path.write_bytes(KEY)
+    path.chmod(0o600)
+    assert read_key(path, "f: link.key_file") == KEY
+    path.write_text(KEY.hex() + "\n")
+    assert read_key(path, "f: link.key_file") == KEY
+    for mode in (0o640, 0o604, 0o700):
+        path.chmod(mode)
+        with pytest.raises(ConfigError, match=r"f: link.key_file: got .*mode 0\d+, wanted mode 0600"):
+            read_key(path, "f: link.key_file")
+    path.chmod(0o600)
+    path.write_bytes(b"short")
+    with pytest.raises(ConfigError, match="32 bytes"):
+        read_key(path, "f: link.key_file")
+    with pytest.raises(ConfigError, match="No such file"):
+        read_key(tmp_path / "none", "f: link.key_file")
