@@ -8,7 +8,7 @@ import hashlib
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -28,12 +28,12 @@ from rtctl.log import schema
 from rtctl.log.fields import size_of, unit_of
 from rtctl.log.header import meshes_of
 from rtctl.log.mesh import unpacked
-from rtctl.log.replay import Logged, inputs
+from rtctl.log.replay import Logged, feedbacks_of, inputs
 from rtctl.log.run import Run
 from rtctl.log.topic import CAN_ROW, Structured, stacked
 from rtctl.protocol import frame
 from rtctl.servo import first_feedback
-from rtctl.types import F64, I64, Command, Drive, Transport
+from rtctl.types import F64, I64, Command, Drive, Request, Transport
 
 BLOCK = 1000  # ticks that are compared at once
 GIVEN = frozenset(("lateness", "compute"))  # copied through, never computed
@@ -76,7 +76,7 @@ class Replay(NamedTuple):
     seconds: float  # taken
     duration: float  # [s] of robot time
     time: F64  # (T,) [s]
-    logged: F64  # (T, n) [Nm] tau_sent
+    logged: F64  # (T, n) [Nm] tau_sent; of a base (T, 2) [m/s] v_world
     replayed: F64  # (T, n)
 
     @property
@@ -136,44 +136,91 @@ class _Null:
         return frames
 
 
+class _Subject(NamedTuple):
+    """What is replayed: an arm or a base."""
+
+    name: str
+    dt: float  # [s]
+    memory: Any
+    tick: Callable[[Any, Any, Request], tuple[Any, Any, Any]]  # (memory, feedback, request)
+    feedbacks: Callable[[Structured], Iterable[Any]]
+    link: CanLink | None  # encodes commands again; None: the records alone are compared
+    shown: str  # the field of a command that is drawn
+
+
+def _arm(run: Run, config: Path | None) -> _Subject:
+    what, robot = rebuilt(run) if config is None else other(config, run)
+    link = CanLink(link_spec(what), cast(Transport, _Null()))
+    memory = initial(robot, first_feedback(_first_q(run)))
+    step = lambda m, feedback, request: tick(robot, m, feedback, request)  # noqa: E731
+    return _Subject(robot.name, robot.dt, memory, step, feedbacks_of, link, "tau_sent")
+
+
+def _base(run: Run, config: Path | None) -> _Subject:
+    from rtctl.config.base import load
+    from rtctl.config.base_derive import build
+    from rtctl.control.base import pipe
+    from rtctl.control.base.record import feedback_from
+
+    header = run.header
+    with tempfile.TemporaryDirectory(prefix="rtctl-replay-") as name:
+        path = Path(name) / "config.toml"
+        path.write_text(header.config, encoding="utf-8")
+        path = path if config is None else config
+        base = build(load(path), path)
+    try:
+        start = feedback_from(np.frombuffer(bytes.fromhex(header.extra.get("start", "")), header.dtype)[0])
+    except (ValueError, IndexError):
+        raise LogError(f"{run.path}: its header has no feedback of the handshake") from None
+    if abs(base.dt - header.period) > 1e-12:
+        raise ConfigError(f"{path}: loop.servo_hz", f"{1.0 / base.dt:g}", f"the log's {1.0 / header.period:g}")
+    step = lambda m, feedback, request: pipe.tick(base, m, feedback, request)  # noqa: E731
+    rows = lambda records: map(feedback_from, records)  # noqa: E731
+    return _Subject(base.name, base.dt, pipe.initial(base, start), step, rows, None, "v_world")
+
+
 def replay(run: Run, config: Path | None = None, progress: Callable[[int], None] = lambda n: None) -> Replay:
     """Return how the tick's replay differs from the log; with `config`, how that config's commands would.
 
     progress: called with the number of ticks done. Raises LogError, ConfigError.
     """
-    what, robot = rebuilt(run) if config is None else other(config, run)
-    link = CanLink(link_spec(what), cast(Transport, _Null()))
+    subject = (_base if run.header.extra.get("kind") == "base" else _arm)(run, config)
+    link, memory = subject.link, subject.memory
     dry = run.header.extra.get("dry") == "1"
-    wire, check = _Wire(run, link, config is None), _Check(run)
-    memory = initial(robot, first_feedback(_first_q(run)))
+    wire = None if link is None else _Wire(run, link, config is None)
+    check = _Check(run, subject.shown)
     digest = hashlib.sha256()
     begun, done = time.perf_counter(), 0
-    for block in _blocks(inputs(run.logs)):
+    for block in _blocks(inputs(run.logs, subject.feedbacks)):
         if not done:
             gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
-        if not done and int(block[0].record["tick"]) != 0:
-            raise LogError(f"{run.path}: begins with tick {block[0].record['tick']}; what was before it is missing")
-        wire.prime(block[0].log_time)
+            if int(block[0].record["tick"]) != 0:
+                raise LogError(f"{run.path}: begins with tick {block[0].record['tick']}; what was before it is missing")
+        if wire is not None:
+            wire.prime(block[0].log_time)
         records, sent = [], []
         for logged in block:
-            memory, command, record = tick(robot, memory, logged.feedback, logged.request)
+            memory, command, record = subject.tick(memory, logged.feedback, logged.request)
             records.append(record)
-            frames = link.write(Command(Drive.DISABLE, command.tau) if dry else command)
-            digest.update(b"".join(frames))
-            sent.append(frames)
-        ticks = [int(logged.record["tick"]) for logged in block]
+            if link is not None:
+                sent.append(link.write(Command(Drive.DISABLE, command.tau) if dry else command))
+                digest.update(b"".join(sent[-1]))
         check.compare([logged.record for logged in block], records)
-        wire.compare([logged.log_time for logged in block], ticks, robot.dt, sent)
+        if wire is not None:
+            ticks = [int(logged.record["tick"]) for logged in block]
+            wire.compare([logged.log_time for logged in block], ticks, subject.dt, sent)
         done += len(block)
         progress(done)
     gc.unfreeze()
     seconds = time.perf_counter() - begun
     if not done:
         raise LogError(f"{run.path}: no tick in it")
-    first = min((d for d in (check.divergence, wire.divergence) if d is not None), key=lambda d: d.tick, default=None)
+    found = (check.divergence, None if wire is None else wire.divergence)
+    first = min((d for d in found if d is not None), key=lambda d: d.tick, default=None)
     return Replay(
-        robot.name, done, wire.frames, digest.hexdigest(), first, check.differences(), check.ignored, seconds,
-        done * robot.dt, np.concatenate(check.time), np.concatenate(check.tau_logged), np.concatenate(check.tau),
+        subject.name, done, 0 if wire is None else wire.frames, "" if link is None else digest.hexdigest(), first,
+        check.differences(), check.ignored, seconds, done * subject.dt,
+        np.concatenate(check.time), np.concatenate(check.tau_logged), np.concatenate(check.tau),
     )  # fmt: skip
 
 
@@ -196,8 +243,8 @@ def _first_q(run: Run) -> F64:
 class _Check:
     """Compares records, block by block."""
 
-    def __init__(self, run: Run) -> None:
-        self.run = run
+    def __init__(self, run: Run, shown: str) -> None:
+        self.run, self.shown = run, shown
         self.divergence: Divergence | None = None
         self.ignored: tuple[str, ...] = ()
         self.time: list[F64] = []
@@ -210,8 +257,8 @@ class _Check:
         ours = np.frombuffer(b"".join(record.tobytes() for record in replayed), replayed[0].dtype)
         theirs = np.frombuffer(b"".join(record.tobytes() for record in logged), logged[0].dtype)
         self.time.append(np.array(theirs["time"]))
-        self.tau.append(np.array(ours["tau_sent"]))
-        self.tau_logged.append(np.array(theirs["tau_sent"]))
+        self.tau.append(np.array(ours[self.shown]))
+        self.tau_logged.append(np.array(theirs[self.shown]))
         if ours.dtype == theirs.dtype and ours.tobytes() == theirs.tobytes():
             return
         mine, its = (set(a.dtype.names or ()) for a in (ours, theirs))

@@ -53,7 +53,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         from rtctl.log.png import plot_pair
 
         labels = ("logged", "replayed" if other is None else other.name)
-        group = ("tau_sent", "Nm", done.logged, done.replayed)
+        shown = ("tau_sent", "Nm") if run.header.joints else ("v_world", "m/s")
+        group = (*shown, done.logged, done.replayed)
         plot_pair(done.time, [group], labels, Path(arguments.plot), run.header.joints)
     if arguments.json:
         print(json.dumps(_as_dict(done, other)))
@@ -89,7 +90,7 @@ def _text(done: Any, other: Path | None, run: Any) -> str:
     if done.ignored:
         lines.append(f"not compared, only one side knows them: {', '.join(done.ignored)}")
     if done.identical:
-        return "\n".join([*lines, f"identical to the bit, digest {done.digest}"])
+        return "\n".join([*lines, f"identical to the bit{f', digest {done.digest}' if done.digest else ''}"])
     d = done.divergence
     what = "first divergence" if other is None else f"{other} commands otherwise from"
     part = f", {d.joint}" if d.joint else ""

@@ -1,6 +1,6 @@
 """The inputs of the tick, out of a log: what a replay feeds to `control.pipe.tick`, bit for bit."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ class Logged(NamedTuple):
     """One tick as it was logged."""
 
     record: Any  # one element of `Header.dtype`: also what came out
-    feedback: Feedback
+    feedback: Any  # Feedback of an arm, BaseFeedback of a base
     request: Request
     log_time: int  # [ns]
 
@@ -63,8 +63,8 @@ def requests_of(log: Log) -> dict[int, Request]:
     return found
 
 
-def inputs(logs: Iterable[Log]) -> Iterator[Logged]:
-    """Yield the ticks of a log's segments, in order.
+def inputs(logs: Iterable[Log], feedbacks: Callable[[Structured], Iterable[Any]] = feedbacks_of) -> Iterator[Logged]:
+    """Yield the ticks of a log's segments, in order; `feedbacks` makes them of records, an arm's unless given.
 
     Raises LogError where a tick is missing: what follows depends on it.
     """
@@ -74,7 +74,7 @@ def inputs(logs: Iterable[Log]) -> Iterator[Logged]:
         for piece in log.pieces(schema.TICK):
             records = piece.array
             ticks, times = records["tick"].tolist(), piece.time.tolist()
-            for k, (tick, feedback) in enumerate(zip(ticks, feedbacks_of(records), strict=True)):
+            for k, (tick, feedback) in enumerate(zip(ticks, feedbacks(records), strict=True)):
                 if expected not in (-1, tick):
                     missing = f"ticks {expected} to {tick - 1} are missing"
                     raise LogError(f"{log.path}: {missing}; what follows depends on them")

@@ -191,10 +191,13 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
         _fill(bins, records, header, limits)
         _obstacles(bins, records, slots)
         for turns, field in ((states, "state"), (statuses, "status"), (faults, "faults"), (cuts, "cut")):
+            if field not in (records.dtype.names or ()):
+                continue
             turns.add(records["time"], records[field])
         lateness.add(np.abs(records["lateness"]))
         compute.add(records["compute"])
-        spectrum.add(records["tau_sent"])
+        if "tau_sent" in (records.dtype.names or ()):
+            spectrum.add(records["tau_sent"])
         figures.add(records)
         done += len(records)
         progress(90 * done // total)
@@ -209,17 +212,18 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
 
 def _fill(bins: Bins, r: Structured, header: Header, limits: dict[str, F64]) -> None:
     """Add the series of a piece that are not per obstacle."""
-    joints = header.joints
-    for name in ("x", "xd", "goal"):
+    joints, have = header.joints, set(r.dtype.names or ())
+    for name in have & {"x", "xd", "goal"}:
         bins.columns(name, r[name], XYZ)
-    for name in ("error", "error_rot", "sigma_min", "innovation", "lateness", "compute"):
+    for name in have & {"error", "error_rot", "sigma_min", "innovation", "lateness", "compute", "v", "w", "heading"}:
         bins.add(name, r[name])
-    for name in ("q", "qd", "tau_sent", "tau_measured"):
+    for name in have & {"q", "qd", "tau_sent", "tau_measured"}:
         bins.columns(name, r[name], joints)
     bins.add("speed", np.linalg.norm(r["xd"], axis=1))
-    for part in PARTS:
+    for part in PARTS if "tau_motion" in have else ():
         bins.add(f"part.{part}", np.linalg.norm(r[f"tau_{part}"], axis=1))
-    bins.add("age", r["age"].max(axis=1))
+    if "age" in have and joints:
+        bins.add("age", r["age"].max(axis=1))
     bins.add("missed", r["missed"].astype(np.float64))
     if "q_min" in limits:
         bins.columns("margin", np.minimum(r["q"] - limits["q_min"], limits["q_max"] - r["q"]), joints)
@@ -229,7 +233,7 @@ def _obstacles(bins: Bins, r: Structured, slots: _Slots) -> None:
     rho = r["rho"]
     active = np.flatnonzero(np.isfinite(rho).any(axis=0))
     for slot in active.tolist():
-        size = np.linalg.norm(r["force"][:, slot], axis=1)
+        size = np.linalg.norm(r["force"][:, slot], axis=1) if "force" in (r.dtype.names or ()) else np.zeros(len(r))
         for name, rows in slots.mine(slot, r["tick"].astype(np.int64)):
             bins.add(f"rho.{name}", np.where(rows, rho[:, slot], np.nan))
             bins.add(f"force.{name}", np.where(rows, size, np.nan))
@@ -255,7 +259,8 @@ class _Figures:
         self.path += float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
         self._tip = r["x"][-1].copy()
         self.speed = max(self.speed, float(np.linalg.norm(r["xd"], axis=1).max()))
-        self.torque = max(self.torque, float(np.abs(r["tau_sent"]).max()))
+        if "tau_sent" in (r.dtype.names or ()):
+            self.torque = max(self.torque, float(np.abs(r["tau_sent"]).max()))
         self.rho = min(self.rho, float(r["rho"].min()))
 
     def as_dict(self) -> dict[str, Any]:
