@@ -192,6 +192,21 @@ def test_segments_that_the_recorder_wrote_replay_as_one_run_and_a_missing_one_is
     assert err.count("\n") == 1
 
 
+def test_a_base_replays_to_the_bit_reports_and_lists_its_packets(tmp_path: Path):
+    world = (ROOT / "configs" / "worlds" / "disc.toml").read_text()
+    rover = json.dumps(str(ROOT / "configs" / "rover.toml"))
+    text = re.sub(r"(?m)^duration_s = .*$", "duration_s = 4.0", re.sub(r"(?m)^robot = .*$", f"robot = {rover}", world))
+    (tmp_path / "world.toml").write_text(text)
+    simulate(tmp_path / "world.toml", log=tmp_path / "rover.mcap")
+    found = answer("replay", str(tmp_path / "rover.mcap"))
+    assert found["identical"]
+    assert found["ticks"] > 100
+    assert {row["way"] for row in answer("mavlink", str(tmp_path / "rover.mcap"))} == {"rx", "tx"}
+    assert call("report", str(tmp_path / "rover.mcap"))[0] == 0
+    assert call("export", str(tmp_path / "rover.mcap"), "--out", str(tmp_path / "a.tlog"))[0] == 0
+    assert call("diff", str(tmp_path / "rover.mcap"), str(tmp_path / "rover.mcap"))[0] == 0
+
+
 def test_meshes_of_urdf_and_config_travel_with_the_log(tmp_path: Path):
     for name in ("arm.stl", "rock.obj"):
         (tmp_path / name).write_bytes(name.encode() * 100)

@@ -201,7 +201,16 @@ def _mavlink(arguments: argparse.Namespace) -> int:
         print(json.dumps([row._asdict() for row in found]))
         return EXIT_OK
     rows = [
-        [r.link, r.way, f"{r.system}/{r.component}", str(r.message), r.name, str(r.packets), f"{r.hz:.1f}", str(r.lost)]
+        [
+            r.link,
+            r.way,
+            f"{r.system}/{r.component}",
+            str(r.message),
+            r.name,
+            str(r.packets),
+            f"{r.hz:.1f}",
+            "-" if r.lost < 0 else str(r.lost),
+        ]
         for r in found
     ]
     head = ["link", "", "sender", "message", "name", "packets", "Hz", "lost by sender"]

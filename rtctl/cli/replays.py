@@ -138,7 +138,11 @@ def _diff(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         from rtctl.log.png import plot_pair
 
-        groups = [("x", "m", *found.tip), ("error", "m", *found.error), ("tau_sent", "Nm", *found.tau)]
+        groups = [
+            ("x", "m", *found.tip),
+            ("error", "m", *found.error),
+            (*(("tau_sent", "Nm") if a.header.joints else ("v_world", "m/s")), *found.tau),
+        ]
         plot_pair(found.time, groups, ("A", "B"), Path(arguments.plot))
     if arguments.json:
         summary = {key: [left, right] for key, left, right in found.summary}

@@ -6,6 +6,7 @@ import numpy as np
 
 from rtctl.errors import LogError
 from rtctl.log import schema
+from rtctl.log.fault import fault_names
 from rtctl.log.fields import called, unit_of
 from rtctl.log.run import Run
 from rtctl.types import F64, State, Status
@@ -63,7 +64,8 @@ def diff(a: Run, b: Run) -> Diff:
         left, right = (getattr(topic, name)[chosen] for _, topic, chosen in both)
         return left, right
 
-    tip, error, tau = pick("x"), pick("error"), pick("tau_sent")
+    shown = "tau_sent" if "tau_sent" in known else "v_world"
+    tip, error, tau = pick("x"), pick("error"), pick(shown)
     left, right = (_figures(run, topic) for run, topic, _ in both)
     summary = tuple((key, left.get(key, "-"), right.get(key, "-")) for key in {**left, **right})
     same = not gaps and len(one) == len(two) == len(rows)
@@ -93,6 +95,7 @@ def _figures(run: Run, topic: Any) -> dict[str, str]:
     states = "; ".join(called(State, s) for s in _turns(topic.state))
     statuses = _turns(topic.status)
     arrived = sum(s == Status.ARRIVED for s in statuses)
+    torque = {"largest torque": f"{np.abs(topic.tau_sent).max():.2f} Nm"} if header.joints else {}
     return {
         "file": run.path.name,
         "config": header.config_sha256[:12],
@@ -104,16 +107,10 @@ def _figures(run: Run, topic: Any) -> dict[str, str]:
         "path of the tip": f"{step:.3f} m",
         "top speed": f"{speed:.3f} m/s",
         "smallest clearance": f"{near.min() * 1e3:.1f} mm" if len(near) else "-",
-        "largest torque": f"{np.abs(topic.tau_sent).max():.2f} Nm",
+        **torque,
         "final error": f"{topic.error[-1] * 1e3:.2f} mm",
-        "faults": ", ".join(_fault_names(topic.faults)) or "none",
+        "faults": ", ".join(fault_names(header, int(np.bitwise_or.reduce(topic.faults)))) or "none",
     }
-
-
-def _fault_names(bits: Any) -> tuple[str, ...]:
-    from rtctl.control.faults import names
-
-    return tuple(names(int(np.bitwise_or.reduce(bits)))) if len(bits) else ()
 
 
 def _turns(values: Any) -> list[int]:

@@ -39,7 +39,7 @@ class Listing(NamedTuple):
     name: str
     packets: int
     hz: float
-    lost: int  # packets of this sender on this link that never came, by the holes in their numbers
+    lost: int  # packets of this sender that never came, by the holes in their numbers; -1: it numbers none
 
 
 def header_of(data: bytes) -> tuple[int, int, int, int] | None:
@@ -115,6 +115,7 @@ def listing(run: Run) -> list[Listing]:
     """Return what was sent on each link, by sender and kind of message."""
     every = packets(run)
     groups: dict[tuple[Any, ...], list[int]] = {}
+    numbers: dict[tuple[Any, ...], set[int]] = {}
     lost: dict[tuple[Any, ...], int] = {}
     last: dict[tuple[Any, ...], int] = {}
     for p in every:
@@ -122,12 +123,15 @@ def listing(run: Run) -> list[Listing]:
         if sender in last:
             lost[sender] = lost.get(sender, 0) + (p.sequence - last[sender] - 1) % 256
         last[sender] = p.sequence
+        numbers.setdefault(sender, set()).add(p.sequence)
         groups.setdefault((*sender, p.message), []).append(p.time)
     rows = []
     for (link, way, system, component, message), times in sorted(groups.items()):
         span = (times[-1] - times[0]) / 1e9
         hz = (len(times) - 1) / span if span > 0.0 else 0.0
-        missing = lost.get((link, way, system, component), 0)
+        sender = (link, way, system, component)
+        counts = len(numbers[sender]) > 1 or len(times) < 3  # a simulated link may number nothing
+        missing = lost.get(sender, 0) if counts else -1
         rows.append(Listing(link, way, system, component, message, name_of(message), len(times), hz, missing))
     return rows
 

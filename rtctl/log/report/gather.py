@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.config.bus import frame_time
-from rtctl.control.faults import FAULTS
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.encode import event_of
+from rtctl.log.fault import fault_table
 from rtctl.log.fields import called
 from rtctl.log.header import Header
 from rtctl.log.report.bins import Bins, Histogram, Spectrum
@@ -179,7 +179,7 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     limits = limits_of(header)
     states = _Turns(lambda v: called(State, v))
     statuses = _Turns(lambda v: called(Status, v).lower())
-    faults = _Bits({1 << i: fault.name for i, fault in enumerate(FAULTS)})
+    faults = _Bits({1 << i: name for i, name in enumerate(fault_table(header))})
     cuts = _Bits({int(cut): cut.name.lower() for cut in Cut if cut and cut.name})
     figures = _Figures()
     done = 0
