@@ -1,14 +1,22 @@
 """From a checked config to the parts that the daemon and the simulation put together."""
 
+import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from rtctl.config import Config, scales
-from rtctl.config.urdf import urdf_file
+from rtctl.config.obstacles import quaternion
+from rtctl.config.urdf import package_folders, urdf_file
 from rtctl.control.robot import Robot
+from rtctl.control.so3 import R_of, quat_of
 from rtctl.hal.can import JointSpec, LinkSpec
-from rtctl.log.header import Header, make_header, meshes_to_files
+from rtctl.log.dbc import DBC, dbc_of
+from rtctl.log.dbc import Joint as DbcJoint
+from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files
+from rtctl.log.mesh import MESHES, archive
+from rtctl.protocol import mit
 from rtctl.types import F64
 
 
@@ -28,15 +36,53 @@ def link_spec(config: Config) -> LinkSpec:
     )
 
 
-def header_of(config: Config, path: Path, robot: Robot, q: F64, **extra: str) -> Header:
-    """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included."""
+def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[int, ...] = (), **extra: str) -> Header:
+    """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included.
+
+    counters: of the link after the handshake.
+    """
+    urdf = urdf_file(config.robot.urdf, path)
+    text = urdf.read_text(encoding="utf-8")
+    files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
+    files |= meshes_to_files(robot.meshes)
+    if meshes := archive(text, urdf.parent, package_folders(urdf), _assets(config), path.resolve().parent):
+        files[MESHES] = meshes
     return make_header(
         robot.name,
         robot.joints,
         robot.slots,
         robot.dt,
         config=path.read_text(encoding="utf-8"),
-        urdf=urdf_file(config.robot.urdf, path).read_text(encoding="utf-8"),
-        files=meshes_to_files(robot.meshes),
-        extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), **extra},
+        urdf=text,
+        extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
+        files=files,
     )
+
+
+def _assets(config: Config) -> tuple[str, ...]:
+    """Return the files that a config's meshes and obstacles name."""
+    named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
+    return tuple(sorted({str(name) for name in named if name}))
+
+
+def drive_dbc(config: Config) -> str:
+    """Return the DBC of the robot's own identifiers and scales."""
+    joints = [DbcJoint(j.name, j.can_id, *scale) for j, scale in zip(config.robot.joints, scales(config), strict=True)]
+    return dbc_of(joints, config.link.protocol == "mit+e2e", mit.REPLY_OFFSET, mit.KP_MAX, mit.KD_MAX)
+
+
+def scene_of(config: Config, robot: Robot) -> str:
+    """Return as JSON what the recorder needs to draw the arm and its obstacles without knowing the robot."""
+    base = config.robot.base_pose
+    wxyz = quat_of(R_of(quaternion(base.rpy_rad, base.wxyz)))
+    points = [[int(link), *p] for link, p in zip(robot.points.link, robot.points.local.tolist(), strict=True)]
+    shapes = [
+        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in robot.obstacles
+    ]
+    scene = {
+        "base": {"position": list(base.position_m), "wxyz": wxyz.tolist()},
+        "tip_frame": config.robot.tip_frame,
+        "points": points,
+        "obstacles": shapes,
+    }
+    return msgspec.json.encode(scene).decode()  # which takes the bytes of a cloud, too

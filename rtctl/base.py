@@ -12,7 +12,7 @@ from rtctl.config.base_derive import key_of
 from rtctl.control.base import faults
 from rtctl.control.base.memory import BaseMemory
 from rtctl.control.base.pipe import initial, tick
-from rtctl.control.base.record import base_dtype
+from rtctl.control.base.record import base_dtype, make_base_record
 from rtctl.control.base.robot import Base
 from rtctl.control.base.signals import Ask, BaseCommand, BaseFeedback
 from rtctl.hal.clock import Slot
@@ -101,9 +101,11 @@ def bounds_of(base: Base, link: MavLink) -> Bounds:
 def header_of(config: BaseConfig, path: Path, base: Base, start: BaseFeedback, **extra: str) -> Header:
     """Return the header of a log: what replay needs beside the ticks, the handshake's pose included."""
     pose = np.array([*start.position, start.yaw])
+    whole = start._replace(slot=max(start.slot, 0))  # a record has no slot before the first
+    first = make_base_record(base.slots, **whole._asdict()).tobytes().hex()  # all of it, for a replay
     header = make_header(
         base.name, (), base.slots, base.dt, config=path.read_text(encoding="utf-8"), buses=(),
-        extra={"pose_handshake": pose.tobytes().hex(), "kind": "base", **extra},
+        extra={"pose_handshake": pose.tobytes().hex(), "kind": "base", "start": first, **extra},
     )  # fmt: skip
     return header._replace(dtype=base_dtype(base.slots), links=(LINK,))
 

@@ -1,5 +1,6 @@
 """`rtctl run`: the servo process. One thread, one absolute grid; all that is slow happens elsewhere."""
 
+import json
 import os
 import select
 import signal
@@ -109,7 +110,8 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         )
         say(f"rtctl: {robot.name} on {family.place(config)}, console {console.path}")
         start = family.greet(config, link, lockstep)
-        recorder = _recorder(config, family.header(config, path, robot, start))
+        header = family.header(config, path, robot, start)
+        recorder = _recorder(config, header._replace(extra={**header.extra, **surroundings(config, link, dry)}))
         servo = Servo(robot, link, recorder, np.zeros(0), dry, machine=family.machine(link), start=start)
         console.publish(lambda: family.status(servo, recorder), lambda: world(servo))
         if not lockstep:
@@ -179,6 +181,19 @@ def _opened(config: Config, path: Path) -> CanLink:
         timeout=config.link.handshake_s,
     )
     return CanLink(spec, transport)
+
+
+def surroundings(config: Any, link: Any, dry: bool) -> dict[str, str]:
+    """Return what a log should tell of the machine, and of the link after its handshake."""
+    clocksource = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    kernel = Path("/sys/kernel/realtime")
+    return {
+        "dry": str(int(dry)),
+        "realtime": config.loop.realtime,
+        "kernel_realtime": kernel.read_text().strip() if kernel.exists() else "no",
+        "clocksource": clocksource.read_text().strip() if clocksource.exists() else "unknown",
+        "counters": json.dumps(getattr(link, "counters", ())),
+    }
 
 
 def _greeted(config: Config, link: CanLink, lockstep: bool) -> Feedback:

@@ -266,7 +266,7 @@ def simulate(
         if log is not None:
             from rtctl.log.writer import McapSink
 
-            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q))
+            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q, counters=link.counters))
         servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
         tally = Tally(robot)
         feed = Feed(robot, scenario, simulator, tally)

@@ -215,12 +215,19 @@ def test_mcap_finds_the_texts_and_the_summary(path: Path) -> None:
     assert read(path).header == header()
 
 
-def test_an_event_is_a_foxglove_log_and_comes_back_as_it_was_put(path: Path) -> None:
+def test_an_event_comes_back_as_it_was_put_and_is_told_as_a_foxglove_log(path: Path) -> None:
     log = read(path)
-    (message,) = log["/event"].json
-    assert (message["message"], message["level"]) == ("fault: bus off", 4)
-    assert message["timestamp"] == {"sec": 0, "nsec": 7_000_000}
-    assert log.events == [{"tick": 7, "time": 0.007, "name": "fault", "detail": "bus off", "log_time": 7_000_000}]
+    (event,) = log.events
+    evidence = event.pop("evidence")
+    assert event == {"tick": 7, "time": 0.007, "name": "fault", "detail": "bus off", "log_time": 7_000_000}
+    assert evidence["tick"] == list(range(150, 200))  # the last ticks before it
+    q = [[x if np.isfinite(x) else None for x in random_record(k, header().dtype)["q"][0]] for k in range(150, 200)]
+    assert evidence["q"] == q
+    said = [(decoder(schema).FromString(m.data), m) for topic, schema, m in messages(path) if topic == "/log"]
+    assert [(m.level, m.message) for m, _ in said] == [
+        (2, "operator: arm"), (2, f"goal: {GOAL.position.tolist()}"), (4, "fault: bus off"),
+    ]  # fmt: skip
+    assert all(m.timestamp.seconds * 10**9 + m.timestamp.nanos == raw.log_time for m, raw in said)
 
 
 def test_a_replay_gets_every_input_back_to_the_bit(path: Path) -> None:

@@ -44,8 +44,8 @@ STAGES = {
     "_record": "record",
 }
 PRIORITY = 80
-FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000}
-QUICK = {"law": 20, "tick": 60, "call": 20, "wake": 20}
+FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000, "log": 10}
+QUICK = {"law": 20, "tick": 60, "call": 20, "wake": 20, "log": 1}
 
 
 class Row(NamedTuple):
@@ -255,6 +255,14 @@ def puts(robot: Robot, count: int) -> Iterator[Row]:
             yield row("ring", f"put {name} ({len(payload)} B)", timed(put, count), note="target p50 below 5 us")
 
 
+def logs(seconds: int) -> Iterator[Row]:
+    """What logging costs and how fast logs load; the load times on ten minutes, or on a little if asked for little."""
+    from tools.bench_log import figures
+
+    for figure in figures(seconds, copies=600 // seconds if seconds > 1 else 1):
+        yield Row("log", figure.name, figure.p50, figure.p99, note=figure.note)
+
+
 def models(robot: Robot, count: int) -> Iterator[Row]:
     """Parameter evaluation."""
     q, qd = robot.home, np.zeros(robot.n)
@@ -328,6 +336,7 @@ def measure(counts: dict[str, int]) -> tuple[dict[str, Any], list[Row]]:
         rows += turns(robot, spec, counts["tick"])
         rows += puts(robot, counts["call"])
         rows += models(robot, counts["call"])
+        rows += logs(counts["log"])
         rows += wakes(robot.dt, floor, why, counts["wake"])
     finally:
         gc.enable()

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Debian packages for tests on real SocketCAN. Installs what is missing where it may (root, apt-get);
+# Debian packages for tests on real SocketCAN and of the report in a browser. Installs what is missing where it may (root, apt-get);
 # otherwise names the command, and everything but those tests works without.
 set -u
 
@@ -12,6 +12,8 @@ af_can() {
 }
 
 missing=""
+have chromium || missing="$missing chromium"
+have chromedriver || missing="$missing chromium-driver"
 have ip || missing="$missing iproute2"
 have cansend || missing="$missing can-utils"
 if ! af_can; then # the kernel has no SocketCAN: a user-mode-linux guest has
@@ -29,5 +31,5 @@ if [ "$(id -u)" = 0 ] && have apt-get; then
         exit 0
     fi
 fi
-echo "tests on SocketCAN need Debian packages that are not here. As root run: apt-get update && $command" >&2
+echo "tests on SocketCAN and in a browser need Debian packages that are not here. As root run: apt-get update && $command" >&2
 exit 1

@@ -1,28 +1,87 @@
-"""`rtctl log`: looking into logs, and writing their topics as CSV."""
+"""`rtctl log`: what a log holds, whether it is whole, what went over the buses, and what is being written now."""
 
 import argparse
-import csv
 import json
-import sys
+import time
+from pathlib import Path
 from typing import Any
 
-from rtctl.cli.parser import Commands, command
-from rtctl.errors import EXIT_OK, UsageError
+from rtctl.cli import pictures, replays
+from rtctl.cli.parser import Commands, command, positive
+from rtctl.cli.progress import bar
+from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 
 
 def add(commands: Commands) -> None:
     """Add the log commands."""
-    log = command(commands, "log", "read a log", "rtctl log info logs/panda.000.mcap")
+    log = command(
+        commands, "log", "read a log", "rtctl log info logs/panda.000.mcap\n  rtctl log report logs/panda.000.mcap"
+    )
     actions = log.add_subparsers(metavar="ACTION", dest="action", required=True)
     info = command(actions, "info", "what a log holds, and how it ended", "rtctl log info run.mcap --json", _info)
-    info.add_argument("file", metavar="FILE")
-    info.add_argument("--json", action="store_true", help="print one JSON object")
-    export = command(
-        actions, "export", "write one topic as CSV", "rtctl log export run.mcap --fields time,x,rho > run.csv", _export
+    _file(info)
+    doctor = command(
+        actions, "doctor", "is a log whole: structure, checksums, numbers, time, decoding",
+        "rtctl log doctor run.mcap", _doctor,
+    )  # fmt: skip
+    _file(doctor)
+    recover = command(
+        actions,
+        "recover",
+        "make logs whole that a crash cut off, and empty the rings it left",
+        RECOVER_EXAMPLE,
+        _recover,
     )
-    export.add_argument("file", metavar="FILE")
-    export.add_argument("--topic", metavar="TOPIC", default="/tick", help="default: %(default)s")
-    export.add_argument("--fields", metavar="A,B,…", default="", help="fields of the topic; default: all")
+    recover.description = RECOVER_TEXT
+    recover.add_argument("path", metavar="FILE|FOLDER")
+    recover.add_argument(
+        "--out", metavar="FILE", default="", help="write the whole log there; default: in place for .open"
+    )
+    recover.add_argument("--json", action="store_true", help="print one JSON object")
+    can = command(
+        actions, "can", "what went over the CAN buses: identifiers, rates, changes, losses, values",
+        "rtctl log can run.mcap\n  rtctl log can run.mcap --dbc configs/drive.dbc --values", _can,
+    )  # fmt: skip
+    _file(can)
+    can.add_argument("--dbc", metavar="FILE", default="", help="decode by this DBC; default: the one in the log")
+    can.add_argument("--values", action="store_true", help="smallest, largest and last value of every signal")
+    mavlink = command(
+        actions, "mavlink", "what went over the MAVLink links: senders, messages, rates, losses",
+        "rtctl log mavlink rover.mcap", _mavlink,
+    )  # fmt: skip
+    _file(mavlink)
+    tail = command(
+        actions, "tail", "follow a log while it is written", "rtctl log tail\n  rtctl log tail logs/ --json", _tail
+    )
+    tail.add_argument("path", metavar="FILE|FOLDER", nargs="?", default="logs", help="default: the newest in logs/")
+    tail.add_argument("--json", action="store_true", help="print a JSON object a line")
+    tail.add_argument("--every", metavar="S", type=positive, default=1.0, help="between two states (%(default)s s)")
+    tail.add_argument("--for", dest="seconds", metavar="S", type=positive, default=float("inf"), help="then stop")
+    pictures.add(actions)
+    replays.add(actions)
+
+
+RECOVER_EXAMPLE = "rtctl log recover logs/\n  rtctl log recover cut.mcap --out whole.mcap"
+RECOVER_TEXT = """Make logs whole that a crash cut off, and empty the rings it left in /dev/shm.
+
+A .open file is closed in place, any other damaged file is copied first. The result is opened again and counted by
+another reader before it is believed. Exit code 0: nothing was lost; 3: whole, but something was lost; 1: failed."""
+
+
+def _file(parser: Any) -> None:
+    parser.add_argument("file", metavar="FILE")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def table(rows: list[list[str]], head: list[str], right: frozenset[int] = frozenset()) -> str:
+    """Return rows as text under a head; the columns in `right` are numbers."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+
+    def line(row: list[str]) -> str:
+        cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(line(row) for row in [head, *rows])
 
 
 def _info(arguments: argparse.Namespace) -> int:
@@ -44,33 +103,173 @@ def _text(found: dict[str, Any]) -> str:
         ("versions", ", ".join(f"{name} {version}" for name, version in found.get("versions", {}).items()) or "-"),
     ]
     lines = [f"{name:9} {text}" for name, text in head]
-    width = max((len(name) for name in found["topics"]), default=5)
-    lines += ["", f"{'topic':{width}}  {'messages':>9} {'Hz':>9} {'holes':>6}  schema"]
-    for name, t in found["topics"].items():
-        lines.append(f"{name:{width}}  {t['messages']:>9} {t['hz']:>9.1f} {t['holes']:>6}  {t['schema']}")
-    return "\n".join(lines)
+    rows = [[n, str(t["messages"]), f"{t['hz']:.1f}", str(t["holes"]), t["schema"]] for n, t in found["topics"].items()]
+    return "\n".join([*lines, "", table(rows, ["topic", "messages", "Hz", "holes", "schema"], frozenset((1, 2, 3)))])
 
 
-def _export(arguments: argparse.Namespace) -> int:
-    from rtctl.log import read
+def _doctor(arguments: argparse.Namespace) -> int:
+    from rtctl.log.examine import examine
 
-    topic = read(arguments.file)[arguments.topic]
-    rows = topic.array
-    names = arguments.fields.split(",") if arguments.fields else list(rows.dtype.names or ())
-    for name in names:
-        if name not in (rows.dtype.names or ()):
-            raise UsageError(f"--fields: got {name!r}, wanted some of {', '.join(rows.dtype.names or ())}")
-    out = csv.writer(sys.stdout, lineterminator="\n")
-    out.writerow(["log_time_ns", *(title for name in names for title in _titles(name, rows[name].shape[1:]))])
-    columns = [rows[name].reshape(len(rows), -1) for name in names]
-    for i, at in enumerate(topic.time.tolist()):
-        out.writerow([at, *(value for column in columns for value in column[i].tolist())])
+    path = Path(arguments.file)
+    with bar("examining", path.stat().st_size if path.is_file() else 1) as progress:
+        findings = examine(path, progress)
+    good = all(f.good for f in findings)
+    if arguments.json:
+        print(json.dumps({"good": good, "findings": [f._asdict() for f in findings]}))
+    else:
+        print(table([["ok" if f.good else "BAD", f.name, f.text] for f in findings], ["", "what", "found"]))
+    return EXIT_OK if good else EXIT_FAILED
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    from rtctl.hal.recorder import rescue
+    from rtctl.log.examine import mend, open_files
+
+    path = Path(arguments.path)
+    if path.is_dir():
+        if arguments.out:
+            raise UsageError("--out: got a folder to recover, wanted one file")
+        cut = open_files(path)
+        done = [mend(file) for file in cut if _free(file)]
+        rescued = [p for p in rescue(path) if p not in {m.path for m in done}]
+    else:
+        done, rescued = [mend(path, Path(arguments.out) if arguments.out else None)], []
+    if arguments.json:
+        rows = [{k: str(v) if isinstance(v, Path) else v for k, v in m._asdict().items()} for m in done]
+        print(json.dumps({"files": rows, "rescued": [str(p) for p in rescued]}))
+    else:
+        for m in done:
+            lost = f"{m.lost_bytes} bytes and {m.damaged} chunks lost" if m.code else "nothing lost"
+            print(f"{m.path}: {m.messages} messages, {lost}; another reader finds {m.independent}, with the sentinel")
+        for p in rescued:
+            print(f"{p}: out of the ring that a crash left")
+        if not done and not rescued:
+            print(f"{path}: nothing to recover")
+    return max((m.code for m in done), default=EXIT_OK)
+
+
+def _free(path: Path) -> bool:
+    """Return whether nobody is writing a file."""
+    import fcntl
+
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+    return True
+
+
+def _can(arguments: argparse.Namespace) -> int:
+    from rtctl.log.export import buses
+    from rtctl.log.run import read_run
+    from rtctl.log.traffic import load_dbc, traffic
+
+    run = read_run(arguments.file)
+    text = load_dbc(Path(arguments.dbc)) if arguments.dbc else ""
+    with bar("reading frames", sum(run.count(bus) for bus in buses(run))) as progress:
+        found = traffic(run, text, progress)
+    if arguments.json:
+        print(json.dumps([{**t._asdict(), "signals": [s._asdict() for s in t.signals]} for t in found]))
+        return EXIT_OK
+    head = ["bus", "id", "", "name", "frames", "Hz", "longest gap", "changed", "lost", "bytes", "last data"]
+    rows = [
+        [
+            t.bus, f"{t.id:03X}", t.way, t.name, str(t.frames), f"{t.hz:.1f}", f"{t.gap_max * 1e3:.2f} ms",
+            f"{100.0 * t.changes / t.frames:.1f} %", "-" if t.lost < 0 else str(t.lost), str(t.length), t.data,
+        ]
+        for t in found
+    ]  # fmt: skip
+    print(table(rows, head, frozenset((4, 5, 6, 7, 8, 9))))
+    if arguments.values:
+        signals = [
+            [t.name, s.name, f"{s.smallest:.6g}", f"{s.largest:.6g}", s.choice or f"{s.last:.6g}", s.unit]
+            for t in found
+            for s in t.signals
+        ]
+        print()
+        print(table(signals, ["message", "signal", "smallest", "largest", "last", "unit"], frozenset((2, 3, 4))))
     return EXIT_OK
 
 
-def _titles(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Return one title per number of a field: q.0, q.1, …; force.3.x would be force.3.0."""
-    titles = [name]
-    for size in shape:
-        titles = [f"{title}.{i}" for title in titles for i in range(size)]
-    return titles
+def _mavlink(arguments: argparse.Namespace) -> int:
+    from rtctl.log.mavlink import listing
+    from rtctl.log.run import read_run
+
+    found = listing(read_run(arguments.file))
+    if arguments.json:
+        print(json.dumps([row._asdict() for row in found]))
+        return EXIT_OK
+    rows = [
+        [
+            r.link,
+            r.way,
+            f"{r.system}/{r.component}",
+            str(r.message),
+            r.name,
+            str(r.packets),
+            f"{r.hz:.1f}",
+            "-" if r.lost < 0 else str(r.lost),
+        ]
+        for r in found
+    ]
+    head = ["link", "", "sender", "message", "name", "packets", "Hz", "lost by sender"]
+    print(table(rows, head, frozenset((3, 5, 6, 7))))
+    return EXIT_OK
+
+
+def _tail(arguments: argparse.Namespace) -> int:
+    from rtctl.log.follow import Follower, newest
+
+    path = Path(arguments.path)
+    follower = Follower(newest(path) if path.is_dir() else path)
+    until = time.monotonic() + arguments.seconds
+    shown = -1e9
+    while True:
+        news = follower.news()
+        for event in news.events:
+            _say(event, arguments.json)
+        if len(news.ticks) and float(news.ticks["time"][-1]) - shown >= arguments.every:
+            shown = float(news.ticks["time"][-1])
+            print(json.dumps(_state(news.ticks[-1])) if arguments.json else _line(news.ticks[-1]), flush=True)
+        if news.ended:
+            print(json.dumps({"ended": news.ended}) if arguments.json else f"ended: {news.ended.get('reason', '?')}")
+            return EXIT_OK
+        if time.monotonic() > until:
+            return EXIT_OK
+        time.sleep(0.1)
+
+
+def _say(event: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({k: v for k, v in event.items() if k != "evidence"}), flush=True)
+        return
+    at, detail = event.get("time", 0.0), event.get("detail", "")
+    text = f"{event.get('name', event.get('message', '?'))}{': ' if detail else ''}{detail}"
+    print(f"{at if isinstance(at, int | float) else 0.0:10.3f} s  {text}", flush=True)
+
+
+def _state(record: Any) -> dict[str, Any]:
+    import numpy as np
+
+    from rtctl.log.fields import called
+    from rtctl.types import State, Status
+
+    rho = record["rho"][np.isfinite(record["rho"])]
+    return {
+        "time_s": float(record["time"]),
+        "tick": int(record["tick"]),
+        "state": called(State, int(record["state"])),
+        "status": called(Status, int(record["status"])).lower(),
+        "x_m": record["x"].tolist(),
+        "error_m": float(record["error"]),
+        "clearance_m": float(rho.min()) if len(rho) else None,
+    }
+
+
+def _line(record: Any) -> str:
+    s = _state(record)
+    near = "" if s["clearance_m"] is None else f"clearance {s['clearance_m'] * 1e3:.1f} mm"
+    x = " ".join(f"{v:+.3f}" for v in s["x_m"])
+    words = [f"{s['time_s']:10.3f} s", f"{s['state']:9}", f"{s['status']:13}", f"tip {x}"]
+    return "  ".join([*words, f"error {s['error_m'] * 1e3:.1f} mm", near]).rstrip()

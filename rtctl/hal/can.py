@@ -108,6 +108,15 @@ class CanLink:
             b"\0\0" + payload + self._padding
         )
 
+    @property
+    def counters(self) -> tuple[int, ...]:
+        """Return the counter of each joint's newest protected frame."""
+        return tuple(self._counters.tolist())
+
+    def set_counter(self, joint: int, counter: int) -> None:
+        """Go on counting a joint's protected frames behind `counter`: a replay takes up a log's count."""
+        self._counters[joint] = counter & 0xFF
+
     def write(self, command: Command) -> list[bytes]:
         """Send one frame to each joint, or drop it; return the raw frames that went out."""
         special = _SPECIAL.get(command.drive)

@@ -1,9 +1,21 @@
-"""Logs: written as MCAP so that nothing is lost, read as arrays: `rtctl.log.read(path)["/tick"].q`."""
+"""Logs: written as MCAP so that nothing is lost, read as arrays.
+
+    tick = rtctl.log.read("run.mcap")["/tick"]
+    tick.q          # (N, n) [rad]  positions that the drives replied
+    tick.tau_sent   # (N, n) [Nm]   torque that was sent, after the limits
+    tick.x          # (N, 3) [m]    tip position, world frame
+    tick.rho        # (N, K) [m]    distance to each obstacle slot
+    tick.time       # (N,) [ns]     log_time; `tick.field("time")` is robot time [s]
+
+`rtctl.log.fields.FIELDS` has the unit and meaning of every field, `rtctl log plot FILE --list` prints them. `read_run`
+reads all segments of a run as one; docs/read_a_log.py is an example.
+"""
 
 from rtctl.log.entry import Kind
 from rtctl.log.header import Header, make_header
 from rtctl.log.reader import Log, read, segments
+from rtctl.log.run import Run, read_run
 from rtctl.log.topic import Topic
 from rtctl.log.writer import McapSink
 
-__all__ = ["Header", "Kind", "Log", "McapSink", "Topic", "make_header", "read", "segments"]
+__all__ = ["Header", "Kind", "Log", "McapSink", "Run", "Topic", "make_header", "read", "read_run", "segments"]

@@ -6,16 +6,20 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from rtctl.log.summary import END
-from rtctl.log.walk import RECORD, Damaged, Source, chunk_head, has_magic, message_index, walk
+from rtctl.log.walk import RECORD, Damaged, Source, chunk_head, has_magic, message_index, rows_of, walk
 
 T = TypeVar("T")
 FOOTER_SIZE = RECORD.size + 20 + 8
+LOOKED_AT = 8  # chunks of a summary whose own records are compared with it
+_INDEX_HEAD = np.dtype([("start", "<u8"), ("end", "<u8"), ("at", "<u8"), ("length", "<u8"), ("table", "<u4")])
+_INDEX_ENTRY = np.dtype([("channel", "<u2"), ("offset", "<u8")])
 
 
 class ChunkRef(NamedTuple):
@@ -86,14 +90,14 @@ def _from_summary(data: Source) -> Catalog | None:
         return None
     found = _empty(True, start)
     span = found.span
-    seen_statistics = False
+    seen_statistics, indices = False, list[tuple[int, int]]()
     try:
         for opcode, body, end in walk(data, start, at):
             if opcode == Opcode.STATISTICS:
                 statistics = parsed(records.Statistics.read, data, body, end)
                 span, seen_statistics = (statistics.message_start_time, statistics.message_end_time), True
             elif opcode == Opcode.CHUNK_INDEX:
-                found.chunks.append(_chunk_index(data, body))
+                indices.append((body, end))
             elif opcode == Opcode.ATTACHMENT_INDEX:
                 index = parsed(records.AttachmentIndex.read, data, body, end)
                 found.attachments[index.name] = (index.offset + RECORD.size, index.offset + index.length)
@@ -102,6 +106,7 @@ def _from_summary(data: Source) -> Catalog | None:
                 _metadata(found, data, place.offset + RECORD.size, place.offset + place.length)
             else:
                 _describe(found, data, opcode, body, end)
+        found.chunks.extend(_chunk_indices(data, indices))
     except (Damaged, struct.error):
         return None
     if not seen_statistics or not found.channels or (not found.chunks and span != (0, 0)):
@@ -109,15 +114,42 @@ def _from_summary(data: Source) -> Catalog | None:
     return found._replace(span=span)
 
 
-def _chunk_index(data: Source, body: int) -> ChunkRef:
-    """Return the chunk that an index record names; its own record is looked at, too."""
-    start, end, at, length, size = struct.unpack_from("<QQQQI", data, body)
-    table = body + 36
-    indices = dict(struct.iter_unpack("<HQ", data[table : table + size // 10 * 10]))
-    opcode, inner = RECORD.unpack_from(data, at)
-    if opcode != Opcode.CHUNK or inner + RECORD.size != length or at + length > len(data):
-        raise Damaged(f"chunk index at {body}: no chunk where it points")
-    return ChunkRef(at + RECORD.size, at + length, start, end, indices)
+def _chunk_indices(data: Source, places: list[tuple[int, int]]) -> list[ChunkRef]:
+    """Return the chunks that the index records at `places` name; of a long file there are thousands, so in bulk.
+
+    Some of the chunks' own records are looked at: a summary of another file is not believed. Looking at each would
+    touch a page of the file for every chunk.
+    """
+    sizes = np.array([end - body for body, end in places], np.int64)
+    bodies = np.array([body for body, _ in places], np.int64)
+    refs: dict[int, ChunkRef] = {}
+    raw = np.frombuffer(data, np.uint8)
+    for size in np.unique(sizes).tolist():
+        mine = bodies[sizes == size]
+        if size < _INDEX_HEAD.itemsize:
+            raise Damaged("chunk index: too short")
+        head = rows_of(raw, mine, _INDEX_HEAD.itemsize).view(_INDEX_HEAD).reshape(-1)
+        for count in np.unique(head["table"] // 10).tolist():
+            chosen = mine[head["table"] // 10 == count]
+            rows = head[head["table"] // 10 == count]
+            if _INDEX_HEAD.itemsize + 10 * count > size:
+                raise Damaged("chunk index: wrong length")
+            table = (
+                rows_of(raw, chosen + _INDEX_HEAD.itemsize, 10 * count).view(_INDEX_ENTRY).reshape(len(chosen), count)
+            )
+            for body, row, ids, offsets in zip(
+                chosen.tolist(), rows.tolist(), table["channel"].tolist(), table["offset"].tolist(), strict=True
+            ):
+                start, end, at, length, _ = row
+                refs[body] = ChunkRef(at + RECORD.size, at + length, start, end, dict(zip(ids, offsets, strict=True)))
+    found = [refs[body] for body in bodies.tolist()]
+    for k in range(LOOKED_AT + 1) if found else ():
+        ref = found[k * (len(found) - 1) // LOOKED_AT]
+        at = ref.body - RECORD.size
+        opcode, inner = RECORD.unpack_from(data, at) if 0 <= at <= len(data) - RECORD.size else (0, 0)
+        if opcode != Opcode.CHUNK or ref.body + inner != ref.end or ref.end > len(data):
+            raise Damaged("chunk index: no chunk where it points")
+    return found
 
 
 def _from_walk(data: Source) -> Catalog:

@@ -1,26 +1,33 @@
 """Entries of the ring into MCAP message records, many at a time and in their order."""
 
 import json
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from rtctl.log import schema
 from rtctl.log.entry import Batch, Kind, Payload
 from rtctl.log.header import Header
+from rtctl.log.scene import HZ, Scene
 from rtctl.log.schema import MESSAGE, Layout
 from rtctl.types import I64, U8
 
 OP_MESSAGE = 5
+INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
+LEVELS = {"rejected": WARNING, "fault": ERROR}  # by the event's name
+EVIDENCE = 50  # ticks that are kept with a fault
+SHOWN = (  # of each tick in a fault's evidence
+    "tick", "time", "missed", "link", "q", "qd", "tau_measured", "age", "replies", "drive", "lateness", "x", "error",
+    "innovation", "tau_wanted", "tau_sent", "cut", "state", "status", "faults",
+)  # fmt: skip
+_TICK, _EVENT, _REQUEST = int(Kind.TICK), int(Kind.EVENT), int(Kind.REQUEST)
 CAN_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("data", "u1", (8,))])
 CANFD_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("data", "u1", (64,))])
 EFF, RTR, ERR = 0x80000000, 0x40000000, 0x20000000  # flag bits of the kernel's can_id
 BRS, ESI = 0x01, 0x02  # of canfd_frame.flags
-LEVELS = {
-    "rejected": 3,
-    "fault": 4,
-}  # of foxglove.Log (3 warning, 4 error) by the event's name; 2, info, for the others
 
 
 class Encoded(NamedTuple):
@@ -88,6 +95,10 @@ class Encoder:
         )
         self._has_state = {"q", "qd", "tau_measured"} <= set(header.dtype.names or ())
         self._can: dict[tuple[int, int], _Rows] = {}
+        self._scene = Scene(header) if self._has_state else None
+        self._due = 0  # [ns] monotonic, of the next scene
+        self._recent: deque[bytes] = deque(maxlen=EVIDENCE)  # the last ticks
+        self._evidence: dict[int, list[bytes]] = {}  # by the index of a fault's entry in the batch
 
     def encode(self, batch: Batch) -> Encoded:
         """Return the records of a batch, dropouts found on the way first.
@@ -98,18 +109,73 @@ class Encoder:
         columns: list[tuple[I64, int, I64, I64, int]] = []
         time = np.array(batch.time, dtype=np.int64)
         sequence = np.array(batch.sequence, dtype=np.int64)
+        views = self._watch(batch)
         for key, indices in self._groups(batch).items():
             rows = np.array(indices, dtype=np.int64)
             payloads = [batch.payload[i] for i in indices]
             columns += self._group(key, rows, payloads, time[rows], sequence[rows], pieces)
         dropouts = self._dropouts(batch)
-        return _assembled(dropouts, pieces, columns)
+        return _assembled(dropouts, pieces, columns, views)
+
+    def _watch(self, batch: Batch) -> list[Encoded]:
+        """Go through a batch in its order: what viewers show, what operators asked, and the evidence of faults."""
+        found: list[Encoded] = []
+        self._evidence.clear()
+        size = self.header.dtype.itemsize
+        ticks: list[Payload] = list(self._recent)
+        for index, (kind, payload, time) in enumerate(zip(batch.kind, batch.payload, batch.time, strict=True)):
+            if kind == _TICK and len(payload) == size:
+                ticks.append(payload)
+                if time >= self._due and self._scene is not None:
+                    found += self._views(self._scene, np.frombuffer(payload, self.header.dtype)[0], time)
+            elif kind == _REQUEST:
+                found += self._asked(bytes(payload), time, ticks[-1] if ticks else None)
+            elif kind == _EVENT:
+                data = event_of(bytes(payload))
+                if data.get("name") == "fault":
+                    self._evidence[index] = [bytes(each) for each in ticks[-EVIDENCE:]]
+                found.append(self._said(level_of(data), text_of(data), time))
+        self._recent.extend(bytes(each) for each in ticks[-EVIDENCE:])  # the ring's memory is not ours to keep
+        return found
+
+    def _views(self, scene: Scene, record: Any, time: int) -> list[Encoded]:
+        period = round(1e9 / HZ)
+        self._due = max(self._due + period, time - period) if self._due else time + period
+        if not scene.can_show(record):
+            return []
+        stamp = time + self.offset
+        return [
+            self._message(schema.TF, time, scene.frames(record, stamp)),
+            self._message(schema.SCENE, time, scene.update(record, stamp)),
+        ]
+
+    def _asked(self, payload: bytes, time: int, tick: Payload | None) -> list[Encoded]:
+        now = float(np.frombuffer(tick, self.header.dtype)["time"][0]) if tick is not None else 0.0
+        if self._scene is not None:
+            self._scene.request(payload, now)
+        data = event_of(payload)
+        said = []
+        if str(data.get("verb", "none")) != "none":
+            said.append(f"operator: {data['verb']}")
+        goal = data.get("goal")
+        if isinstance(goal, dict):
+            said.append(f"goal: {goal.get('position')}")
+        return [self._said(INFO, text, time) for text in said]
+
+    def _said(self, level: int, text: str, time: int) -> Encoded:
+        message = Log(level=Log.Level.Name(level), message=text, name="rtctl")
+        stamp = time + self.offset
+        message.timestamp.seconds, message.timestamp.nanos = stamp // 1_000_000_000, stamp % 1_000_000_000
+        return self._message(schema.LOG, time, message.SerializeToString(deterministic=True))
 
     def own(self, topic: str, time: int, content: dict[str, Any]) -> Encoded:
         """Return one message of the recorder itself; time: monotonic [ns]."""
+        return self._message(topic, time, json.dumps(content).encode())
+
+    def _message(self, topic: str, time: int, content: bytes) -> Encoded:
         channel = self._id[topic]
         sequence = self._own[channel] = self._own.get(channel, 0) + 1
-        data = message(channel, sequence, time + self.offset, json.dumps(content).encode())
+        data = message(channel, sequence, time + self.offset, content)
         return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel, sequence, time + self.offset, 0)))
 
     def _groups(self, batch: Batch) -> dict[tuple[int, int, int], list[int]]:
@@ -222,9 +288,20 @@ class Encoder:
         for number, row in enumerate(rows.tolist()):
             data = bytes(payloads[number])
             if kind == Kind.EVENT:
-                data = log_message(data, times[number])
+                data = self._event(data, row)
             pieces[row] = message(channel, sequences[number], times[number], data)
         return [(rows, channel, stamp, sequence, 0)]
+
+    def _event(self, payload: bytes, row: int) -> bytes:
+        """Return an event's JSON, a fault's with its evidence; what is not a JSON object becomes its message."""
+        evidence = self._evidence.get(row)
+        if not evidence and event_is_object(payload):
+            return payload
+        data = event_of(payload)
+        if evidence:
+            records = np.frombuffer(b"".join(evidence), self.header.dtype)
+            data["evidence"] = {name: _plain(records[name]) for name in SHOWN if name in (records.dtype.names or ())}
+        return json.dumps(data).encode()
 
     def _dropouts(self, batch: Batch) -> list[Encoded]:
         """Return a dropout for every hole in the entries' numbers, and move on."""
@@ -264,35 +341,55 @@ def _stamp(head: np.ndarray[Any, Any], stamp: I64, sequence: I64) -> None:
     head["sequence"], head["log"], head["publish"] = sequence, stamp, stamp
 
 
-def log_message(event: bytes, time: int) -> bytes:
-    """Return an event as a foxglove.Log in JSON; what is not a JSON object becomes its message."""
+def event_of(payload: bytes) -> dict[str, Any]:
+    """Return the JSON object of an event or request; {"message": text} for anything else."""
     try:
-        data = json.loads(event)
+        data = json.loads(payload)
     except (ValueError, RecursionError):
         data = None
-    if not isinstance(data, dict):
-        data = {"message": bytes(event).decode("utf-8", "replace")}
-    text = data.get("message") or ": ".join(str(data[key]) for key in ("name", "detail") if data.get(key))
-    log = {
-        "timestamp": {"sec": time // 1_000_000_000, "nsec": time % 1_000_000_000},
-        "level": LEVELS.get(str(data.get("name")), 2),
-        "message": str(text),
-        "name": "rtctl",
-        "file": "",
-        "line": 0,
-        "data": data,
-    }
-    return json.dumps(log).encode()
+    return data if isinstance(data, dict) else {"message": payload.decode("utf-8", "replace")}
 
 
-def _assembled(first: list[Encoded], pieces: list[Payload], columns: list[tuple[I64, int, I64, I64, int]]) -> Encoded:
+def event_is_object(payload: bytes) -> bool:
+    """Return whether a payload is a JSON object."""
+    try:
+        return isinstance(json.loads(payload), dict)
+    except (ValueError, RecursionError):
+        return False
+
+
+def text_of(event: dict[str, Any]) -> str:
+    """Return an event as people read it."""
+    return str(event.get("message") or ": ".join(str(event[key]) for key in ("name", "detail") if event.get(key)))
+
+
+def level_of(event: dict[str, Any]) -> int:
+    """Return the level of foxglove.Log: 2 info, 3 warning, 4 error."""
+    return LEVELS.get(str(event.get("name")), INFO)
+
+
+def _plain(values: np.ndarray[Any, Any]) -> Any:
+    """Return numbers for JSON, which has no infinities: those become null."""
+    if values.dtype.kind != "f":
+        return values.tolist()
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
+
+
+def _assembled(
+    first: list[Encoded], pieces: list[Payload], columns: list[tuple[I64, int, I64, I64, int]], last: list[Encoded]
+) -> Encoded:
     """Return everything as one block, its columns in the order of the bytes."""
     lead = b"".join(e.data for e in first)
     sizes = np.fromiter(map(len, pieces), np.int64, len(pieces))
     starts = np.cumsum(sizes) - sizes + len(lead)
     channel, time, sequence, offset = ([] for _ in range(4))  # type: tuple[list[I64], list[I64], list[I64], list[I64]]
     at = 0
-    for e in first:
+    behind = len(lead) + int(sizes.sum())
+    for k, e in enumerate([*first, *last]):
+        if k == len(first):
+            at = behind
         channel.append(e.channel)
         time.append(e.time)
         sequence.append(e.sequence)
@@ -309,7 +406,7 @@ def _assembled(first: list[Encoded], pieces: list[Payload], columns: list[tuple[
     offsets = np.concatenate(offset)
     order = np.argsort(offsets, kind="stable")
     return Encoded(
-        lead + b"".join(pieces),
+        lead + b"".join(pieces) + b"".join(e.data for e in last),
         np.concatenate(channel)[order],
         np.concatenate(sequence)[order],
         np.concatenate(time)[order],

@@ -29,6 +29,8 @@ PACKAGES = (
     "pymavlink",
 )
 
+SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing
+
 MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
 
@@ -47,7 +49,7 @@ class Header(NamedTuple):
     versions: Mapping[str, str]
     revision: str  # of the program's own repository, "" when it does not run from one
     extra: Mapping[str, str]  # handshake values, realtime settings, ...
-    files: Mapping[str, str]  # further attachments: name -> text (scenario, DBC)
+    files: Mapping[str, str | bytes]  # further attachments by name (scenario, DBC, meshes)
     links: tuple[str, ...] = ()  # MAVLink; an entry's `kind >> 8` is the index
 
     @property
@@ -65,7 +67,7 @@ def make_header(
     urdf: str = "",
     buses: Sequence[str] = ("can0",),
     extra: Mapping[str, str] | None = None,
-    files: Mapping[str, str] | None = None,
+    files: Mapping[str, str | bytes] | None = None,
 ) -> Header:
     """Return the header of a robot of `joints` and `slots` obstacle slots ticking each `period` [s]."""
     return Header(
@@ -96,7 +98,9 @@ def meshes_of(header: Header) -> Meshes:
     meshes = NONE
     for name, text in header.files.items():
         if name.startswith(MESH):
-            meshes = added(meshes, name.removeprefix(MESH), np.frombuffer(b64decode(text, validate=True), np.float64))
+            meshes = added(
+                meshes, name.removeprefix(MESH), np.frombuffer(b64decode(str(text), validate=True), np.float64)
+            )
     return meshes
 
 
@@ -144,7 +148,21 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
 
 def header_to_json(header: Header) -> str:
     """Return the header as JSON text, for the ring and for the log's metadata."""
-    return json.dumps(header._replace(dtype=dtype_to_json(header.dtype))._asdict())  # type: ignore[arg-type]
+    raw = header._replace(dtype=dtype_to_json(header.dtype))._asdict()  # type: ignore[arg-type]
+    return json.dumps({**raw, "files": {name: _to_text(content) for name, content in header.files.items()}})
+
+
+def _to_text(content: str | bytes) -> str | list[str]:
+    return content if isinstance(content, str) else [b64encode(content).decode()]
+
+
+def _from_text(value: Any) -> str | bytes:
+    return b64decode(value[0]) if isinstance(value, list) else str(value)
+
+
+def of_attachment(name: str, data: bytes) -> str | bytes:
+    """Return an attachment's content as `Header.files` has it: bytes for archives, text for everything else."""
+    return data if name.endswith(".zip") else data.decode("utf-8", "replace")
 
 
 def header_from_json(text: str) -> Header:
@@ -165,6 +183,6 @@ def header_from_json(text: str) -> Header:
         versions={str(k): str(v) for k, v in raw["versions"].items()},
         revision=str(raw["revision"]),
         extra={str(k): str(v) for k, v in raw["extra"].items()},
-        files={str(k): str(v) for k, v in raw["files"].items()},
+        files={str(k): _from_text(v) for k, v in raw["files"].items()},
         links=tuple(map(str, raw.get("links", ()))),
     )

@@ -3,22 +3,31 @@
 import contextlib
 import glob
 import mmap
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from mcap import records
 
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.catalog import Catalog, ChunkRef, attachment, catalog, describe_chunk
-from rtctl.log.header import Header, header_from_json
+from rtctl.log.header import Header, header_from_json, of_attachment
+from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.log.segment import INFO, OPEN
 from rtctl.log.summary import INDEX_ENTRY
-from rtctl.log.topic import Topic
-from rtctl.log.walk import I64_MAX, MESSAGE, RECORD, Damaged, Source, chunk_data, chunk_head, chunk_messages
+from rtctl.log.topic import Part, Topic
+from rtctl.log.walk import I64_MAX, MESSAGE, RECORD, Damaged, Source, chunk_data, chunk_head, chunk_messages, rows_of
 from rtctl.log.walk import message_index as index_entries
 from rtctl.types import I64
+
+T = TypeVar("T")
+THREADS = min(4, os.cpu_count() or 1)  # zstd, checksums and numpy's copies let go of the interpreter's lock
+PIECE = 64  # chunks at a time of `pieces`
 
 
 class Log:
@@ -31,7 +40,7 @@ class Log:
             self._catalog: Catalog = catalog(data)
         except Damaged as error:
             raise LogError(f"{path}: {error}") from None
-        self.damaged = 0  # chunks that could not be read
+        self._damaged: set[int] = set()
         self._topics: dict[str, Topic] = {}
         if not self._catalog.channels or not self._catalog.complete:
             self._describe_from_chunks()
@@ -44,6 +53,11 @@ class Log:
                 records_of_chunk = self._chunk(chunk)
                 describe_chunk(self._catalog, records_of_chunk or b"")
                 known = set(self._catalog.channels)
+
+    @property
+    def damaged(self) -> int:
+        """Return the chunks met so far that could not be read."""
+        return len(self._damaged)
 
     @property
     def complete(self) -> bool:
@@ -59,6 +73,13 @@ class Log:
     def size(self) -> int:
         """Return the size of the file [bytes] when it was opened."""
         return len(self._data)
+
+    def channel(self, topic: str) -> tuple[records.Channel, records.Schema | None]:
+        """Return the channel and schema records of a topic. Raises LogError when the file has no such topic."""
+        for channel in self._catalog.channels.values():
+            if channel.topic == topic:
+                return channel, self._catalog.schemas.get(channel.schema_id)
+        raise LogError(f"{self.path}: no topic {topic}; it has {', '.join(self.topics)}")
 
     def schema_of(self, topic: str) -> str:
         """Return the name of a topic's schema, or its encoding when it has none."""
@@ -78,20 +99,14 @@ class Log:
         """Return by topic: messages, first and last sequence number. From the file's end, else by reading it all."""
         if self._catalog.counts:
             return dict(self._catalog.counts)
-        found = {}
-        for name in self.topics:
-            topic = self[name]
-            if len(topic):
-                found[name] = (len(topic), int(topic.sequence[0]), int(topic.sequence[-1]))
-        return found
+        return dict(self._walked[0])
 
     @property
     def span(self) -> tuple[int, int]:
         """Return log_time [ns] of the first and of the last message; (0, 0) when there is none."""
         if self._catalog.span != (0, 0):
             return self._catalog.span
-        times = [self[name].time for name in self.topics if len(self[name])]
-        return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else (0, 0)
+        return self._walked[1]
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -121,9 +136,9 @@ class Log:
                 header = header_from_json(text)
             except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
                 raise LogError(f"{self.path}: has no header of rtctl") from None
-            texts = {name: data.decode("utf-8", "replace") for name, data in self.attachments.items()}
-            config, urdf = texts.pop("config.toml", ""), texts.pop("robot.urdf", "")
-            self._header = header._replace(config=config, urdf=urdf, files=texts)
+            files = {name: of_attachment(name, data) for name, data in self.attachments.items()}
+            config, urdf = str(files.pop("config.toml", "")), str(files.pop("robot.urdf", ""))
+            self._header = header._replace(config=config, urdf=urdf, files=files)
         return self._header
 
     @property
@@ -141,7 +156,7 @@ class Log:
         Raises LogError when the file has no such topic.
         """
         if topic not in self._topics:
-            self._topics[topic] = self._read(topic)
+            self._topics[topic] = self._topic(topic, self._catalog.chunks, True)
         return self._topics[topic]
 
     @property
@@ -158,14 +173,27 @@ class Log:
         found = self[schema.SENTINEL].json if schema.SENTINEL in self else []
         return found[-1] if found else {}
 
+    @property
+    def dropouts(self) -> list[dict[str, Any]]:
+        """Return the spans in which entries are missing, each with its `count`."""
+        return self[schema.DROPOUT].json if schema.DROPOUT in self.counts else []
+
     def window(self, topic: str, start: int, stop: int) -> Topic:
         """Return the messages of a topic with start <= log_time < stop [ns], reading only the chunks they are in.
 
         Raises LogError when the file has no such topic.
         """
-        return self._read(topic, start, stop)
+        return self._topic(topic, self._catalog.chunks, True, start, stop)
 
-    def _read(self, name: str, start: int = 0, stop: int = I64_MAX) -> Topic:
+    def pieces(self, topic: str) -> Iterator[Topic]:
+        """Yield a topic some chunks at a time, so that any length fits into memory. Raises LogError without it."""
+        chunks = self._catalog.chunks
+        for at in range(0, len(chunks), PIECE):
+            yield self._topic(topic, chunks[at : at + PIECE], False)
+        if self._catalog.loose:
+            yield self._topic(topic, [], True)
+
+    def _topic(self, name: str, chunks: list[ChunkRef], loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
         if not ids:
             raise LogError(f"{self.path}: no topic {name}; it has {', '.join(self.topics)}")
@@ -176,32 +204,43 @@ class Log:
         if schema_name == "rtctl.Tick":
             with contextlib.suppress(LogError):  # a start without header: the messages stay as they are
                 dtype = self.header.dtype
-        topic = Topic(name, channel, schema_name, dtype)
-        columns = [part for i in ids for part in self._parts(i, start, stop)]
-        if columns:
-            topic.time = np.concatenate([c[0] for c in columns])
-            topic.sequence = np.concatenate([c[1] for c in columns])
-            topic.payloads = [payload for c in columns for payload in c[2]]
-        return topic
 
-    def _parts(self, channel: int, start: int, stop: int) -> Iterator[tuple[I64, I64, list[bytes]]]:
-        """Yield times, sequence numbers and payloads of a channel, chunk by chunk."""
-        for chunk in self._catalog.chunks:
-            if chunk.end_time < start or chunk.start_time >= stop or (chunk.indices and channel not in chunk.indices):
-                continue
-            records_of_chunk = self._chunk(chunk)
-            if records_of_chunk is not None:
-                yield _select(records_of_chunk, self._offsets(chunk, channel, records_of_chunk), channel, start, stop)
-        loose = self._catalog.loose
-        if loose:
-            rows = np.array([body - RECORD.size for body, _ in loose], dtype=np.int64)
-            yield _select(self._data, rows, channel, start, stop)
+        def source(work: Callable[[Part], T]) -> list[T]:
+            return [done for i in ids for done in self._map(work, i, chunks, loose, start, stop)]
+
+        return Topic(name, channel, schema_name, dtype, source)
+
+    def _map(
+        self, work: Callable[[Part], T], channel: int, chunks: list[ChunkRef], loose: bool, start: int, stop: int
+    ) -> Iterator[T]:
+        """Yield what `work` makes of a channel's messages, chunk by chunk; chunks are unpacked by several threads."""
+
+        def one(chunk: ChunkRef) -> T | None:
+            content = self._chunk(chunk)
+            return (
+                None
+                if content is None
+                else work(_part(content, self._offsets(chunk, channel, content), channel, start, stop))
+            )
+
+        wanted = [
+            c for c in chunks if c.end_time >= start and c.start_time < stop and (not c.indices or channel in c.indices)
+        ]
+        if len(wanted) > 2:
+            with ThreadPoolExecutor(THREADS) as pool:
+                found = list(pool.map(one, wanted))
+        else:
+            found = [one(chunk) for chunk in wanted]
+        yield from (done for done in found if done is not None)
+        if loose and self._catalog.loose:
+            rows = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
+            yield work(_part(self._data, rows, channel, start, stop))
 
     def _chunk(self, chunk: ChunkRef) -> bytes | None:
         try:
             return chunk_data(self._data, chunk_head(self._data, chunk.body, chunk.end))
         except Damaged:
-            self.damaged += 1
+            self._damaged.add(chunk.body)
             return None
 
     def _offsets(self, chunk: ChunkRef, channel: int, records_of_chunk: bytes) -> I64:
@@ -222,23 +261,44 @@ class Log:
         walked: I64 = messages.offset[messages.channel == channel]
         return walked
 
+    @cached_property
+    def _walked(self) -> tuple[dict[str, tuple[int, int, int]], tuple[int, int]]:
+        """Return `counts` and `span` from the messages themselves, unpacking each chunk once."""
+        counts: dict[str, tuple[int, int, int]] = {}
+        low, high = I64_MAX, 0
 
-def _select(data: Source, offsets: I64, channel: int, start: int, stop: int) -> tuple[I64, I64, list[bytes]]:
-    """Return times, sequence numbers and payloads of the messages at `offsets` that are what is wanted."""
-    times, sequences, payloads = [], [], []
-    size = len(data)
-    for at in offsets.tolist():
-        if not 0 <= at <= size - RECORD.size - MESSAGE.size:
-            continue
-        opcode, length = RECORD.unpack_from(data, at)
-        found, sequence, time, _ = MESSAGE.unpack_from(data, at + RECORD.size)
-        end = at + RECORD.size + length
-        if opcode != 5 or found != channel or end > size or not start <= time < stop:
-            continue
-        times.append(time)
-        sequences.append(sequence)
-        payloads.append(data[at + RECORD.size + MESSAGE.size : end])
-    return np.array(times, dtype=np.int64), np.array(sequences, dtype=np.int64), payloads
+        def add(part: Part, topic: str) -> None:
+            nonlocal low, high
+            if len(part.time):
+                n, first, _ = counts.get(topic, (0, int(part.sequence[0]), 0))
+                counts[topic] = (n + len(part.time), first, int(part.sequence[-1]))
+                low, high = min(low, int(part.time.min())), max(high, int(part.time.max()))
+
+        loose = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
+        for chunk in self._catalog.chunks:
+            content = self._chunk(chunk)
+            for i, channel in self._catalog.channels.items() if content is not None else ():
+                if not chunk.indices or i in chunk.indices:
+                    add(_part(content or b"", self._offsets(chunk, i, content or b""), i, 0, I64_MAX), channel.topic)
+        for i, channel in self._catalog.channels.items() if len(loose) else ():
+            add(_part(self._data, loose, i, 0, I64_MAX), channel.topic)
+        return dict(sorted(counts.items())), (low, high) if counts else (0, 0)
+
+
+def _part(data: Source, offsets: I64, channel: int, start: int, stop: int) -> Part:
+    """Return the messages at `offsets` that are what is wanted."""
+    raw = np.frombuffer(data, np.uint8)
+    size = len(raw)
+    offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
+    head = rows_of(raw, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD).reshape(-1)
+    time = head["log"]
+    good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start) & (time < min(stop, I64_MAX))
+    body = head["length"] - np.uint64(MESSAGE.size)  # wraps for a length that is too small: then it is too large
+    good &= body <= np.uint64(size) - offsets.astype(np.uint64) - np.uint64(MESSAGE_HEAD.itemsize)
+    if not good.all():
+        head, offsets, body = head[good], offsets[good], body[good]
+    at = offsets + MESSAGE_HEAD.itemsize
+    return Part(data, at, body.astype(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
 
 
 def read(path: Path | str) -> Log:

@@ -1,6 +1,6 @@
 """The inputs of the tick, out of a log: what a replay feeds to `control.pipe.tick`, bit for bit."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,32 +9,41 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.reader import Log
 from rtctl.log.request import decode_request
+from rtctl.log.topic import Structured
 from rtctl.types import Feedback, Request
+
+QUIET = Request()
 
 
 class Logged(NamedTuple):
     """One tick as it was logged."""
 
     record: Any  # one element of `Header.dtype`: also what came out
-    feedback: Feedback
+    feedback: Any  # Feedback of an arm, BaseFeedback of a base
     request: Request
+    log_time: int  # [ns]
 
 
-def feedback_of(record: Any) -> Feedback:
-    """Return the feedback that a record was made from."""
-    return Feedback(
-        slot=int(record["slot"]),
-        missed=int(record["missed"]),
-        q=np.array(record["q"], dtype=np.float64),
-        qd=np.array(record["qd"], dtype=np.float64),
-        tau=np.array(record["tau_measured"], dtype=np.float64),
-        age=np.array(record["age"], dtype=np.float64),
-        replies=np.array(record["replies"], dtype=np.int64),
-        drive=np.array(record["drive"], dtype=np.int64),
-        link=int(record["link"]),
-        lateness=float(record["lateness"]),
-        compute=float(record["compute"]),
-    )
+def feedbacks_of(records: Structured) -> Iterator[Feedback]:
+    """Yield the feedback that each record was made from."""
+    q, qd, tau, age = (np.ascontiguousarray(records[name]) for name in ("q", "qd", "tau_measured", "age"))
+    replies, drive = (records[name].astype(np.int64) for name in ("replies", "drive"))
+    scalars = ("slot", "missed", "link", "lateness", "compute")
+    rows = zip(*(records[name].tolist() for name in scalars), strict=True)
+    for k, (slot, missed, link, lateness, compute) in enumerate(rows):
+        yield Feedback(
+            slot=slot,
+            missed=missed,
+            q=q[k],
+            qd=qd[k],
+            tau=tau[k],
+            age=age[k],
+            replies=replies[k],
+            drive=drive[k],
+            link=link,
+            lateness=lateness,
+            compute=compute,
+        )
 
 
 def requests_of(log: Log) -> dict[int, Request]:
@@ -42,7 +51,9 @@ def requests_of(log: Log) -> dict[int, Request]:
 
     Raises LogError when one cannot be read: a replay without it would not be one.
     """
-    found = {}
+    found: dict[int, Request] = {}
+    if schema.REQUEST not in log:
+        return found
     for payload in log[schema.REQUEST].payloads:
         try:
             tick, request = decode_request(payload)
@@ -52,17 +63,20 @@ def requests_of(log: Log) -> dict[int, Request]:
     return found
 
 
-def inputs(logs: Iterable[Log]) -> Iterator[Logged]:
-    """Yield the ticks of a log's segments, in order.
+def inputs(logs: Iterable[Log], feedbacks: Callable[[Structured], Iterable[Any]] = feedbacks_of) -> Iterator[Logged]:
+    """Yield the ticks of a log's segments, in order; `feedbacks` makes them of records, an arm's unless given.
 
     Raises LogError where a tick is missing: what follows depends on it.
     """
     expected = -1
     for log in logs:
         requests = requests_of(log)
-        for record in log[schema.TICK].array:
-            tick = int(record["tick"])
-            if expected not in (-1, tick):
-                raise LogError(f"{log.path}: ticks {expected} to {tick - 1} are missing; what follows depends on them")
-            expected = tick + 1
-            yield Logged(record, feedback_of(record), requests.get(tick, Request()))
+        for piece in log.pieces(schema.TICK):
+            records = piece.array
+            ticks, times = records["tick"].tolist(), piece.time.tolist()
+            for k, (tick, feedback) in enumerate(zip(ticks, feedbacks(records), strict=True)):
+                if expected not in (-1, tick):
+                    missing = f"ticks {expected} to {tick - 1} are missing"
+                    raise LogError(f"{log.path}: {missing}; what follows depends on them")
+                expected = tick + 1
+                yield Logged(records[k], feedback, requests.get(tick, QUIET), times[k])

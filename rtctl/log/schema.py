@@ -9,6 +9,9 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 
 from rtctl.log.header import Header
@@ -16,6 +19,9 @@ from rtctl.log.header import Header
 TICK = "/tick"
 JOINT_STATES = "/joint_states"
 EVENT = "/event"
+LOG = "/log"
+TF = "/tf"
+SCENE = "/scene"
 REQUEST = "/request"
 DROPOUT = "/log/dropout"
 SENTINEL = "/log/sentinel"
@@ -232,16 +238,14 @@ def _json_schema(title: str, properties: dict[str, Any], required: tuple[str, ..
 
 
 _INTEGER, _STRING, _OBJECT = {"type": "integer"}, {"type": "string"}, {"type": "object"}
-_LOG_SCHEMA = _json_schema(
-    "foxglove.Log",
+_EVENT_SCHEMA = _json_schema(
+    "rtctl.Event",
     {
-        "timestamp": {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}},
-        "level": {"type": "integer", "description": "1 debug, 2 info, 3 warning, 4 error, 5 fatal"},
-        "message": _STRING,
-        "name": _STRING,
-        "file": _STRING,
-        "line": _INTEGER,
-        "data": {"type": "object", "description": "the event as the controller put it"},
+        "tick": _INTEGER,
+        "time": {"type": "number", "description": "robot time [s]"},
+        "name": {"type": "string", "description": "state, fault, rejected, or a status"},
+        "detail": _STRING,
+        "evidence": {"type": "object", "description": "of a fault: fields of the last ticks, oldest first"},
     },
 )
 _REQUEST_SCHEMA = _json_schema(
@@ -259,17 +263,37 @@ def channels(header: Header) -> tuple[Channel, ...]:
     rows = [
         (TICK, "protobuf", "rtctl.Tick", "protobuf", tick),
         (JOINT_STATES, "cdr", "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE_MSG.encode()),
-        (EVENT, "json", "foxglove.Log", "jsonschema", _LOG_SCHEMA),
+        (EVENT, "json", "rtctl.Event", "jsonschema", _EVENT_SCHEMA),
         (REQUEST, "json", "rtctl.Request", "jsonschema", _REQUEST_SCHEMA),
         (DROPOUT, "json", "rtctl.Dropout", "jsonschema", _DROPOUT_SCHEMA),
         (SENTINEL, "json", "rtctl.Sentinel", "jsonschema", _SENTINEL_SCHEMA),
         (POSITION, "json", "rtctl.Position", "jsonschema", _POSITION_SCHEMA),
+        (LOG, "protobuf", "foxglove.Log", "protobuf", descriptor_set(Log.DESCRIPTOR)),
+        (TF, "protobuf", "foxglove.FrameTransforms", "protobuf", descriptor_set(FrameTransforms.DESCRIPTOR)),
+        (SCENE, "protobuf", "foxglove.SceneUpdate", "protobuf", descriptor_set(SceneUpdate.DESCRIPTOR)),
     ]
     rows += [(can_topic(bus), "protobuf", "rtctl.CanFrame", "protobuf", can) for bus in header.buses]
     for link in header.links:
         packet = mavlink_descriptor()
         rows += [(mavlink_topic(link, way), "protobuf", MAVLINK, "protobuf", packet) for way in ("rx", "tx")]
     return tuple(Channel(number, *row) for number, row in enumerate(rows, start=1))
+
+
+def descriptor_set(message: Any) -> bytes:
+    """Return the serialized FileDescriptorSet of a message with all the files it needs, each after its own needs."""
+    found: dict[str, Any] = {}
+
+    def add(file: Any) -> None:
+        for need in file.dependencies:
+            add(need)
+        found.setdefault(file.name, file)
+
+    add(message.file)
+    files = FileDescriptorSet()
+    for file in found.values():
+        file.CopyToProto(files.file.add())
+    data: bytes = files.SerializeToString()
+    return data
 
 
 def can_topic(bus: str) -> str:

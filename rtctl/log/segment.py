@@ -3,12 +3,12 @@
 import fcntl
 import os
 import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import zstandard
+from isal import isal_zlib
 from mcap import records
 from mcap.opcode import Opcode
 
@@ -21,6 +21,7 @@ OPEN = ".open"  # suffix while a file is being written
 CHUNK_BYTES = 256 << 10
 LEVEL = 1  # on such rows smaller and faster than 3
 INFO = "rtctl"  # the metadata record with the header
+MEDIA = {".urdf": "application/xml", ".zip": "application/zip", ".json": "application/json"}  # of attachments
 
 
 class Segment:
@@ -38,7 +39,7 @@ class Segment:
         self.size = size  # bytes that are whole; a torn write behind them is cut off
         self.pending = 0  # bytes of the chunk that is being filled
         self._chunk: list[Encoded] = []
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self.compressor = zstandard.ZstdCompressor(level=LEVEL)
 
     def add(self, encoded: Encoded) -> None:
         """Put messages into the current chunk; they reach the disk with `flush`."""
@@ -58,9 +59,9 @@ class Segment:
         bases = np.cumsum([0] + [len(e.data) for e in chunk[:-1]])
         offset = np.concatenate([e.offset + base for e, base in zip(chunk, bases, strict=True)])
         data = b"".join(e.data for e in chunk)
-        packed_data = self._compressor.compress(data)
+        packed_data = self.compressor.compress(data)
         start, end = int(time.min()), int(time.max())
-        head = struct.pack("<QQQI", start, end, len(data), zlib.crc32(data)) + struct.pack("<I4s", 4, b"zstd")
+        head = struct.pack("<QQQI", start, end, len(data), isal_zlib.crc32(data)) + struct.pack("<I4s", 4, b"zstd")
         head += struct.pack("<Q", len(packed_data))
         record = struct.pack("<BQ", Opcode.CHUNK, len(head) + len(packed_data)) + head + packed_data
         indices, starts = message_indices(channel, time, offset)
@@ -154,9 +155,9 @@ def _start(
     info |= {f"version.{name}": version for name, version in header.versions.items()}
     data += summary.add_metadata(len(data), INFO, {**info, "revision": header.revision, **more})
     files = {"config.toml": header.config, "robot.urdf": header.urdf, **header.files}
-    for name, text in files.items():
-        kind = "application/xml" if name.endswith(".urdf") else "text/plain"
-        data += summary.add_attachment(len(data), name, kind, text.encode(), time)
+    for name, content in files.items():
+        raw = content.encode() if isinstance(content, str) else content
+        data += summary.add_attachment(len(data), name, MEDIA.get(Path(name).suffix, "text/plain"), raw, time)
     return data
 
 

@@ -2,17 +2,17 @@
 
 import mmap
 import struct
-import zlib
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
+from isal import isal_zlib
 from mcap.opcode import Opcode
 
 from rtctl.log.summary import INDEX_ENTRY, MAGIC
-from rtctl.types import I64
+from rtctl.types import I64, U8
 
 RECORD = struct.Struct("<BQ")
 CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
@@ -34,6 +34,14 @@ class Messages(NamedTuple):
 
 class Damaged(ValueError):
     """A record does not mean what its place in the file says."""
+
+
+def rows_of(raw: U8, at: I64, size: int) -> U8:
+    """Return `size` bytes from each of the places `at`, (len(at), size)."""
+    if not len(at) or not size:
+        return np.zeros((len(at), size), np.uint8)
+    every: U8 = np.ndarray((len(raw) - size + 1, size), np.uint8, raw, 0, (1, 1))  # as_strided takes ten times as long
+    return every[at]
 
 
 def walk(data: Source, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
@@ -102,7 +110,7 @@ def chunk_data(data: Source, head: ChunkHead) -> bytes:
         raise Damaged(f"chunk: {error}") from None
     finally:
         raw.release()
-    if len(records) != head.size or (head.crc and zlib.crc32(records) != head.crc):
+    if len(records) != head.size or (head.crc and isal_zlib.crc32(records) != head.crc):
         raise Damaged("chunk: checksum or size differs")
     return records
 
