@@ -8,7 +8,7 @@ import pytest
 from rtctl.control import faults
 from rtctl.servo import Turn
 from rtctl.types import F64, Link, Request, State, Verb
-from tests.lab import DOWN, Standing, lab, robot
+from tests.lab import DOWN, Standing, goal, lab, robot
 
 JOINT = 1  # carries the arm's weight
 WARNED = Link.DERATED
@@ -110,6 +110,27 @@ def test_an_encoder_that_sticks_while_its_joint_moves_stops_the_arm(joint: int):
     seen, after, _, _ = broken(f"stuck_encoder@1.0:{joint}", 0.15)
     assert seen & {"encoder_stuck", "innovation"}
     assert 0.0 < after < 0.1
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+def test_an_encoder_that_sticks_at_rest_is_seen_by_the_torque_that_moves_its_joint(joint: int):
+    with lab(inject=(f"stuck_encoder@0.5:{joint}",)) as here:
+        here.running()
+        while here.simulator.time < 0.6:
+            here.step()
+        here.ask([0.5, 0.3, 0.5], DOWN)
+        while here.memory.state == State.RUN and here.simulator.time < 1.0:
+            here.step()
+        assert faults.names(here.servo.faults_seen) == ("encoder_stuck",)
+        assert np.abs(here.simulator.truth().qd).max() < 1.0
+
+
+def test_an_arm_that_is_held_while_a_goal_pushes_has_no_stuck_encoder():
+    arm = Standing(arm=robot()._replace(safety=robot().safety._replace(innovation_max=1e9)))
+    arm.tick(Request(goal=goal(arm.memory, [0.5, 0.3, 0.5])))
+    arm.ticks(300)
+    assert np.abs(arm.memory.qdd * np.diag(arm.memory.model.A))[4] > arm.robot.safety.friction[4]
+    assert arm.state() == State.RUN
 
 
 def test_an_encoder_whose_speed_is_wrong_stops_the_arm():

@@ -134,6 +134,24 @@ def test_a_pocket_is_given_up_in_bounded_time_after_both_sides():
     assert clearance(POCKET, flight.X) > 0.015
 
 
+def test_an_escape_stays_along_the_axes_that_the_goal_asks_for():
+    plane, line = (ASKED._replace(task=task) for task in (Task.X | Task.Y, Task.X))
+    push = escape.push_of(mass(START), np.array([-2.0, 1.0, 5.0]), plane)
+    assert push.tolist() == [-2.0, 1.0, 0.0]
+
+    def chosen(s: Escape, goal: Goal) -> Escape:
+        while s.phase == Phase.CHOOSING:
+            s = escape.chosen(s, mass(START), START, goal, world(WALL), START, 3.0, 0.1, 0.02)
+        return s
+
+    s = chosen(escape.begun(Escape(), 1.0, push), plane)
+    way = escape.way(s, push, MOTION)
+    assert s.phase == Phase.FIRST
+    assert abs(way[2]) < 1e-12
+    assert abs(way @ push) < 0.4 * np.linalg.norm(way) * np.linalg.norm(push)
+    assert chosen(escape.begun(Escape(), 1.0, push[0] * EYE[0]), line).phase == Phase.GIVEN_UP  # nowhere to go
+
+
 @pytest.mark.parametrize("d", [0.99, 1.0])
 def test_no_second_escape_begins_where_the_first_one_did(d: float):
     old = Escape(hit=1.0)

@@ -117,6 +117,13 @@ def ball_on_goal(near: float) -> Callable[[Arm], list[dict[str, Any]]]:
     return slots
 
 
+def creeping(speed: float, pause: int, ticks: int) -> Callable[[Arm], list[dict[str, Any]]]:
+    """A joint so slow [rad/s] that its encoder repeats itself for `pause` ticks between two steps."""
+    return lambda arm: [
+        {"q": arm.q + joint(2, 1e-3 * pause * speed * (k // pause)), "qd": joint(2, speed)} for k in range(ticks)
+    ]
+
+
 CASES = {
     "feedback_stale": Case(said(age_of(4)), said(age_of(3))),
     "feedback_lost": Case(said(age_of(11)), said(age_of(10))),
@@ -134,8 +141,8 @@ CASES = {
         said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 5), said(*[{"drive": np.array([1, 1, 0, 1, 1, 1, 1])}] * 4)
     ),
     "torque_mismatch": Case(off_torque(3.0, 6), off_torque(0.5, 20)),
-    "encoder_stuck": Case(said(*[{"qd": joint(2, 0.5)}] * 25), said(*[{"qd": joint(2, 0.04)}] * 28)),
-    "velocity_mismatch": Case(said(*[{"qd": joint(2, 1.5)}] * 25), said(*[{"qd": joint(2, 0.1)}] * 13)),
+    "encoder_stuck": Case(said(*[{"qd": joint(2, 0.5)}] * 25), creeping(0.015, 25, 150)),
+    "velocity_mismatch": Case(said(*[{"qd": joint(2, 1.5)}] * 25), said(*[{"qd": joint(2, 0.1)}] * 14)),
     "encoder_jump": Case(jumps(0.3, 0.3), jumps(0.003, 0.0, 0.3, 0.0, 0.003, 0.0)),
     "not_finite": Case(said({"qd": joint(3, np.nan)})),
     "deadline": Case(said(*[{"missed": 1}] * 3), said({"missed": 1}, {"missed": 1}, {}, {"missed": 9})),

@@ -2,29 +2,39 @@
 
 import json
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import coal
+import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from rtctl import config as cfg
+from rtctl import daemon
 from rtctl.cli import main
+from rtctl.cli.planning import message_of, obstacles_told
 from rtctl.cli.values import goal_messages
 from rtctl.config.obstacles import shape_of
 from rtctl.config.read import convert
 from rtctl.config.scenario import Scenario, load_scenario, scenario_dict
 from rtctl.control import world
 from rtctl.control.own import hulls_of
-from rtctl.errors import PlanError
+from rtctl.control.primitives import distances
+from rtctl.control.so3 import exp3, quat_of
+from rtctl.control.task import between
+from rtctl.errors import PlanError, RequestError
 from rtctl.hal.messages import GoalMessage, decode
 from rtctl.planner import plan
 from rtctl.stream import REPLANS, Follower, Seen
-from rtctl.types import F64, Goal, Task
+from rtctl.types import F64, Goal, ObstacleEdit, Shape, Task
+from tests.bodies import cloud_shape, ell, known, mesh_shape, torus
 from tests.lab import ROOT, changed, play, robot
 
 TRAP = ROOT / "configs" / "scenarios" / "trap.toml"
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
+EYE = np.eye(3)
 
 
 def trap(**keys: object) -> dict[str, Any]:
@@ -61,6 +71,64 @@ def test_a_planned_way_is_clear_of_everything_by_coal_and_the_same_for_the_same_
                 for box, pose in boxes:
                     d = coal.distance(hull.shape, at, box, pose, coal.DistanceRequest(), coal.DistanceResult())
                     assert d > arm.avoid.rho_min
+
+
+def test_an_arm_in_a_plane_is_led_around_along_the_axes_that_it_has():
+    file = ROOT / "configs" / "planar4.toml"
+    arm = cfg.build(cfg.load(file), file)
+    size, at = np.array([0.12, 0.12, 0.2]), np.array([1.28, 0.68, 0.0])
+    crate = Shape("crate", "box", np.array([*size, 0.0]), at, UNIT, np.zeros(3), np.zeros(3))
+    obstacles = world.with_static(world.empty(arm.slots), (crate,)).obstacles
+    goals = plan(arm, arm.home, to(1.25, 0.35, 0.3), obstacles)  # it moves at the height it has
+    assert [g.task for g in goals] == [arm.axes] * (len(goals) - 1) + [Task.X | Task.Y]
+    for goal in goals:
+        links = np.cumsum(goal.posture)  # four links of 0.5 m
+        np.testing.assert_allclose(
+            goal.position[:2], 0.5 * np.array([np.cos(links).sum(), np.sin(links).sum()]), atol=2e-4
+        )
+        P = arm.body.evaluate(goal.posture, np.zeros(4), arm.points).P
+        away = np.linalg.norm(np.maximum(np.abs(P - at) - size, 0.0), axis=1) - arm.points.radius
+        assert away.min() > arm.avoid.rho_min
+        told = message_of(goal)
+        assert told["axes"] == ["x", "y"]
+        assert ("wxyz" in told) == bool(goal.task & Task.RZ)
+
+
+def test_a_plan_to_a_direction_ends_in_a_posture_that_points_there():
+    arm, aim = robot(), np.array([0.8, 0.6, 0.0])
+    turn = quat_of(exp3(between(EYE[0], aim)))
+    asked = Goal(np.zeros(3), turn, Task.DIRECTION, 0.003, 0.015, EYE[0])
+    q = plan(arm, arm.home, asked, world.empty(arm.slots).obstacles)[-1].posture
+    data = arm.body.model.createData()
+    pin.framesForwardKinematics(arm.body.model, data, q)
+    tip = data.oMf[arm.body.model.getFrameId("panda_hand_tcp")]
+    np.testing.assert_allclose(tip.rotation[:, 0], aim, atol=2e-3)
+
+
+def test_the_obstacles_of_a_running_robot_come_over_as_they_are():
+    """Distances of the far side's obstacles and of those that were told, to the bit."""
+    arm = robot()._replace(meshes=known(other=ell(), torus=torus()))
+    ball = Shape("ball", "sphere", np.array([0.1, 0, 0, 0]), EYE[1], UNIT, 0.1 * EYE[0], np.zeros(3))
+    edits = (ObstacleEdit("ball", ball, 0.2, True), ObstacleEdit("ring", mesh_shape("torus", 0.4 * EYE[0])))
+    table, refusal = world.edited(world.empty(arm.slots, arm.meshes, creep=0.1), edits)
+    assert not refusal
+    servo: Any = SimpleNamespace(memory=SimpleNamespace(world=table))
+
+    def told() -> dict[str, Any]:
+        reply: dict[str, Any] = json.loads(msgspec.json.encode(daemon.world(servo), enc_hook=lambda a: a.tolist()))
+        return reply
+
+    P = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
+    rho, _ = distances(P, np.zeros(50), table.obstacles)
+    here = arm._replace(meshes=known(torus=torus()))  # at another place among the meshes of this side
+    again, _ = distances(P, np.zeros(50), obstacles_told(told(), here))
+    np.testing.assert_array_equal(rho[:2], again[:2])
+    with pytest.raises(RequestError, match="ring is the mesh torus, which the config does not have"):
+        obstacles_told(told(), robot())
+    table, _ = world.edited(table, (ObstacleEdit("dust", cloud_shape(P, 1e-4, 0.01, EYE[0])),))
+    servo.memory.world = table
+    with pytest.raises(RequestError, match="dust is a cloud"):
+        obstacles_told(told(), here)
 
 
 def test_the_trap_is_left_by_the_planned_way_without_contact():

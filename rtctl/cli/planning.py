@@ -92,7 +92,7 @@ def _with_daemon(arguments: argparse.Namespace, robot: Robot, goal: Goal) -> int
     with Session(daemon_of(arguments), arguments.reply) as session:
 
         def planned(q: F64, seed: int) -> list[Goal]:
-            known = _known(accepted(session.ask({"verb": "world"})), robot)
+            known = obstacles_told(accepted(session.ask({"verb": "world"})), robot)
             return plan(robot, q, goal, known, seed, within=arguments.within)
 
         status = accepted(session.ask({"verb": "status"}))
@@ -141,7 +141,7 @@ def _step(session: Session, follower: Follower, status: dict[str, Any]) -> None:
         send(session, {"verb": "goal", **message_of(goal)})
 
 
-def _known(reply: dict[str, Any], robot: Robot) -> Obstacles:
+def obstacles_told(reply: dict[str, Any], robot: Robot) -> Obstacles:
     """Return the obstacles of a daemon's answer to `world`. Raises RequestError for those that it cannot tell of."""
     known, rows = obstacles_empty(robot.slots, robot.meshes), reply["obstacles"]
     count = len(reply["names"])

@@ -183,7 +183,8 @@ def _lost(robot: Robot, m: Memory, law: Law, status: Status) -> str:
     F = _drive(robot, m, law)
     miss = F - matvec(m.model.J, matvec(m.model.A_inv, tmatvec(m.model.J, matvec(m.space.Lambda, F))))
     v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, miss[:3], miss[3:])
-    part, word = (v, "move along") if norm(v) > norm(w) else (w, "turn about")
+    linear = status == Status.UNREACHABLE or norm(v) > robot.motion.length * norm(w)
+    part, word = (v, "move along") if linear else (w, "turn about")
     u = part / max(norm(part), 1e-12)
     error, _ = error_of(m.goal, m.tip.x, m.tip.R)
     far = f", {error:.3f} m too far" if status == Status.UNREACHABLE else ""

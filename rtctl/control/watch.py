@@ -1,7 +1,8 @@
 """A watch on encoders: one that repeats itself while the joint must move, one whose speed is not that of its position.
 
 The evidence is asked for conservatively. Friction, a payload or a wall may hold a joint against a torque that moves the
-model, so only torque beyond what the drives themselves may be wrong by counts, and only for a moment.
+model, so only torque beyond what the drives themselves may be wrong by counts, only for a moment, and only while other
+joints move: an arm that stands as a whole is held. What it pushes against is for the innovation to say.
 """
 
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from numba import njit
 from rtctl.types import F64, I64
 
 STUCK_TIME = 0.02  # [s] that a position must have been the same to the bit
+STIRRED = 0.05  # [rad/s] of some joint whose position changes: the arm is not held as a whole
 STUCK_TRAVEL = 5e-3  # [rad] that the joint should have come meanwhile
 MEMORY = 0.1  # [s] for which a travel that did not happen counts
 SHARE = 0.1  # of a new difference of speeds in the filtered one: 10 ticks
@@ -40,7 +42,9 @@ def _watched(
     q_previous: F64, age_previous: F64, qdd: F64, A: F64, friction: F64, bound: F64, elapsed: float, dt: float,
 ) -> tuple[F64, F64, F64, F64, I64, bool, bool]:  # fmt: skip
     equal, speed, travel, residual, odd = equal.copy(), speed.copy(), travel.copy(), residual.copy(), odd.copy()
-    stuck, disagree = False, False
+    stuck, disagree, stirred = False, False, False
+    for i in range(q.shape[0]):
+        stirred = stirred or (replies[i] > 0 and q[i] != q_previous[i] and abs(qd[i]) > STIRRED)
     for i in range(q.shape[0]):
         if replies[i] == 0:
             continue  # silence is a fault of its own
@@ -49,7 +53,8 @@ def _watched(
             equal[i], travel[i], speed[i] = 0.0, 0.0, qd[i]
         else:
             equal[i] += elapsed
-            speed[i] = speed[i] + qdd[i] * elapsed if abs(A[i, i] * qdd[i]) > friction[i] else qd[i]
+            free = stirred and abs(A[i, i] * qdd[i]) > friction[i]
+            speed[i] = speed[i] + qdd[i] * elapsed if free else qd[i]
             travel[i] += elapsed * (speed[i] - travel[i] / MEMORY)
             stuck = stuck or (equal[i] >= STUCK_TIME and abs(travel[i]) > STUCK_TRAVEL)
         apart = max(elapsed + age_previous[i] - age[i], dt)
