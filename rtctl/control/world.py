@@ -21,6 +21,7 @@ from rtctl.control.primitives import (
 )
 from rtctl.types import B1, F64, ObstacleEdit, Shape
 
+EASE = 0.25  # of its growth with which a margin falls again: given back at once, every observation would be a blow
 SLOTS = 64
 AGE_MAX = 3600.0  # [s] of an observation; NaN and times to come are none
 
@@ -96,7 +97,7 @@ def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
     age[slot] = edit.age
     shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
     moving[slot] = edit.feed or bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
-    obstacles = with_shape(world.obstacles, slot, shape, known=world.known)
+    obstacles = with_shape(world.obstacles, slot, shape, known=world.known)._replace(margin=world.obstacles.margin)
     world = world._replace(obstacles=obstacles, names=_at(world.names, slot, edit.name), age=age, moving=moving)
     return _with_margins(_joined(world, slot, shape.group))
 
@@ -118,19 +119,21 @@ def _without(world: World, slot: int) -> World:
     moving = world.moving.copy()
     moving[slot] = False
     world = world._replace(obstacles=without(world.obstacles, slot), names=_at(world.names, slot, ""), moving=moving)
-    return _joined(world, slot, "")
+    return _with_margins(_joined(world, slot, ""))
 
 
-def _with_margins(world: World) -> World:
-    margin = world.creep * np.minimum(world.age, world.stale) * world.moving
-    return world._replace(obstacles=world.obstacles._replace(margin=margin))
+def _with_margins(world: World, dt: float = 0.0) -> World:
+    due = world.creep * np.minimum(world.age, world.stale)
+    kept = world.obstacles.margin - EASE * world.creep * dt
+    return world._replace(obstacles=world.obstacles._replace(margin=np.maximum(due, kept) * world.moving))
 
 
 def advanced(world: World, dt: float) -> World:
     """Return the table dt [s] later: poses extrapolated, observations older."""
     if not scan.any_set(world.moving):
         return world
-    return _with_margins(world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving))
+    world = world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving)
+    return _with_margins(world, dt)
 
 
 def distance_from(world: World, x: F64) -> F64:
