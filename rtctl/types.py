@@ -121,8 +121,7 @@ class Task(IntFlag, boundary=STRICT):
     POSE = POSITION | ORIENTATION
 
 
-TOOL_Z = np.array([0.0, 0.0, 1.0])
-TOOL_Z.setflags(write=False)
+TOOL_Z = np.array([0.0, 0.0, 1.0])  # writable as every array: a read-only one is another type to compiled kernels
 
 
 class Goal(NamedTuple):

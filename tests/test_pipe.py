@@ -1,9 +1,11 @@
 """The tick is a function: equal inputs give equal bits, nothing else goes in, nothing else comes out."""
 
 import builtins
+import json
 import os
 import random
 import socket
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -12,25 +14,11 @@ import numpy as np
 import pytest
 
 from rtctl import config as cfg
-from rtctl.control import (
-    arm_field,
-    bvh,
-    estimator,
-    faults,
-    field,
-    firas,
-    law,
-    limits,
-    linalg,
-    osc,
-    primitives,
-    scan,
-    so3,
-    world,
-)
 from rtctl.control.memory import Memory
 from rtctl.control.pipe import initial, tick, warm
+from rtctl.control.so3 import quat_of
 from rtctl.hal.clock import lockstep
+from rtctl.hal.messages import Bounds, decode, request_of
 from rtctl.log import read, segments
 from rtctl.log.replay import inputs
 from rtctl.servo import first_feedback
@@ -40,6 +28,15 @@ from tests.arms import PANDA_HOME
 from tests.bodies import cloud_shape
 from tests.lab import DOWN, PANDA, Lab, Standing, at_rest, goal, healthy, lab, leaves, robot, same, seen, sphere
 
+MESSAGES: tuple[dict[str, Any], ...] = (
+    {"verb": "goal", "position_m": [0.5, 0.2, 0.5]},
+    {"verb": "goal", "position_m": [0.5, 0.1, 0.5], "rpy_rad": [3.1, 0.0, 0.1]},
+    {"verb": "goal", "position_m": [0.5, 0.2, 0.5], "direction": [0.1, 0.0, -1.0], "tool_axis": "z"},
+    {"verb": "goal", "direction": [0.1, 0.0, -1.0]},
+    {"verb": "goal", "position_m": [0.5, 0.2, 0.5], "axes": ["x", "y"]},
+    {"verb": "obstacle", "set": {"name": "o", "type": "box", "size_m": [0.1, 0.1, 0.1], "position_m": [0.5, 0.6, 0.5]}},
+    {"verb": "obstacle", "clear": "o"},
+)
 BALL = sphere("ball", [0.5, 0.15, 0.5], 0.06, (0.0, -0.05, 0.0))
 
 
@@ -119,29 +116,15 @@ def test_the_tick_reads_no_clock_no_file_and_no_chance(monkeypatch: pytest.Monke
 
 
 def test_warming_compiles_all_that_a_run_needs():
+    warm(robot())
     kernels = {
-        f"{module.__name__}.{name}": thing
-        for module in (
-            arm_field,
-            bvh,
-            estimator,
-            faults,
-            field,
-            firas,
-            law,
-            limits,
-            linalg,
-            osc,
-            primitives,
-            scan,
-            so3,
-            world,
-        )
-        for name, thing in vars(module).items()
+        f"{module}.{name}": thing
+        for module in sorted(sys.modules)
+        if module.startswith("rtctl.control.") and not module.startswith("rtctl.control.base")
+        for name, thing in vars(sys.modules[module]).items()
         if hasattr(thing, "signatures")
     }
     assert len(kernels) > 30
-    warm(robot())
     before = {name: len(kernel.signatures) for name, kernel in kernels.items()}
     with lab() as here:
         eventful(here)
@@ -149,6 +132,15 @@ def test_warming_compiles_all_that_a_run_needs():
         cloud = cloud_shape(dust, 1e-4, 0.01, np.array([0.6, 0.3, 0.5]))
         for feed in (True, False):
             here.step(Request(obstacles=(ObstacleEdit("dust", cloud, 0.01, feed), ObstacleEdit("again", cloud))))
+            here.run(0.01)
+    with lab() as here:
+        here.running()
+        arm = robot()
+        bounds = Bounds(tuple(arm.base.tolist()), arm.reach, arm.tolerance, arm.tolerance_rot, arm.axes)
+        for said in MESSAGES:
+            message = decode(json.dumps(said).encode())
+            here.step(request_of(message, bounds, lambda: quat_of(here.memory.tip.R).tolist()))
+            assert not here.memory.verdict
             here.run(0.01)
     assert {name: len(kernel.signatures) for name, kernel in kernels.items()} == before
 

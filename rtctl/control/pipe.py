@@ -30,8 +30,8 @@ from rtctl.control.session import (
     supervised,
     with_goal,
 )
-from rtctl.control.so3 import quat_of
-from rtctl.control.task import error_of, point_of, selected, selection, task_error
+from rtctl.control.so3 import exp3, quat_of
+from rtctl.control.task import between, error_of, point_of, selected, selection, task_error
 from rtctl.types import (
     F64,
     TOOL_Z,
@@ -332,6 +332,7 @@ def warm(robot: Robot) -> None:
         beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))
         tick(robot, beside, feedback, Request(goal=goal, verb=Verb.RESET))  # the obstacles move on by themselves
     _warm_competence(robot, moving, feedback)
+    quat_of(exp3(between(TOOL_Z, -TOOL_Z)))  # of a goal that names a direction
     stopping = m._replace(state=State.SAFE_STOP, reaction=Severity.SS1)
     tick(robot, stopping, feedback, Request())
 
