@@ -385,7 +385,8 @@ def test_a_controller_that_was_suspended_sends_no_burst_and_does_not_move_again(
             until(lambda: "drive_fault" in rig.status()["faults"], lambda: f"not noticed: {rig.status()}")
             until(lambda: len(tap.commands(asleep)) > 20 * JOINTS, lambda: "sends nothing")
             commands = tap.commands(asleep)
-            assert len(commands) <= JOINTS * ((commands[-1].at - woken) / period + 2)
+            # beside the grid's own: the turn that was interrupted, the late one, and the first slot of the window
+            assert len(commands) <= JOINTS * ((commands[-1].at - woken) / period + 3)
             assert rig.status()["missed"] >= 200
             until(lambda: all(one.stop for one in tap.commands()[-JOINTS:]), lambda: "goes on asking for torque")
             np.testing.assert_allclose(rig.report()["q_rad"], stood, atol=1e-3)
