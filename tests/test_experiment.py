@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from rtctl import experiment
 from rtctl.cli import main
 from rtctl.control.firas import field_params
-from rtctl.experiment import bounce, enclosure, limits, line, moving, potential, puma, rates
+from rtctl.experiment import bounce, enclosure, limits, line, minimum, moving, potential, puma, rates
 from rtctl.experiment.mass import Mass, motion_params, obstacles_of
 from rtctl.experiment.outline import Figurine
 from rtctl.experiment.style import styled
@@ -219,6 +219,22 @@ def test_the_command_writes_a_figure_and_its_numbers_the_same_each_time(tmp_path
         a, b = ((tmp_path / folder / f"bounce.{kind}").read_bytes() for folder in ("a", "b"))
         assert a == b, kind
     assert (tmp_path / "a" / "bounce.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_field_stays_before_a_wall_and_in_a_bucket_and_help_leads_out():
+    f = minimum.figures(minimum.run(seconds=(6.2, 8.0, 5.2, 4.0)))
+    for name, arrived, held in (
+        ("wall", False, {"wall"}),
+        ("escape", True, set()),
+        ("trap", False, {"floor", "near", "far", "left", "right"}),
+        ("plan", True, set()),
+    ):
+        one = f[name]
+        assert (one["arrived"], one["status"]) == (arrived, "arrived" if arrived else "local_minimum"), name
+        assert {part.partition(" at ")[0] for part in one["held_by"].split("; ") if part} <= held, name
+        assert one["contacts"] == 0, name
+        assert one["min_clearance_m"] > 0.02, name
+        assert one["faults"] == [], name
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import Any
 
 from rtctl.errors import UsageError
 
-NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "rates", "bounce")
+NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "minimum", "rates", "bounce")
 DIGITS = 9  # of a number in a JSON file
 
 
