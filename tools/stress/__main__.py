@@ -58,13 +58,14 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--count", type=int, default=500, help="scenarios over all robots together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--first", type=int, default=0, metavar="INDEX", help="leave out each robot's before this one")
     parser.add_argument("--only", metavar="ROBOT:INDEX", help="this scenario alone")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was seen of every scenario")
     parser.add_argument("--out", type=Path, default=Path("out/stress"), help="where scenarios that fail are written")
     parser.add_argument("--verbose", action="store_true", help="a line for every scenario")
     args = parser.parse_args(argv)
-    if args.count < 1 or args.jobs < 1:
-        parser.error("--count and --jobs: at least 1")
+    if args.count < 1 or args.jobs < 1 or args.first < 0:
+        parser.error("--count and --jobs: at least 1; --first: at least 0")
     return args
 
 
@@ -75,8 +76,11 @@ def _cases(args: argparse.Namespace) -> list[Case]:
             raise SystemExit(f"stress: --only: got {args.only}, wanted ROBOT:INDEX")
         return [(robot, args.seed, int(index))]
     robots = [name for name in args.robots.split(",") if name]
-    # robot by robot: a process derives each only once
-    return [(r, args.seed, k) for j, r in enumerate(robots) for k in range((args.count - j - 1) // len(robots) + 1)]
+    share = [(args.count - j - 1) // len(robots) + 1 for j in range(len(robots))]
+    cases = [(r, args.seed, k) for r, n in zip(robots, share, strict=True) for k in range(args.first, n)]
+    if not cases:
+        raise SystemExit(f"stress: --first: got {args.first}, wanted less than the {max(share, default=0)} of a robot")
+    return cases  # robot by robot: a process derives each only once
 
 
 def run(case: Case) -> Result:
