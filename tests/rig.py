@@ -97,14 +97,17 @@ class Tap:
             sock.close()
 
 
-def config_at(folder: Path, changes: Mapping[str, str] | None = None, can: str = "", name: str = "panda") -> Path:
-    """Write the Panda's file with a bus, a console and logs of its own; return its path.
+def config_at(
+    folder: Path, changes: Mapping[str, str] | None = None, can: str = "", name: str = "panda", robot: str = "panda"
+) -> Path:
+    """Write a robot's file with a bus, a console and logs of its own; return its path.
 
     `can` names a SocketCAN interface instead; `changes` replaces values by key, `{"servo_hz": "500"}`.
     """
     (folder / "run").mkdir(mode=0o700, exist_ok=True)
     bus = {"interface": '"socketcan"', "channel": f'"{can}"'} if can else {"channel": f'"{folder}/bus"'}
-    text = PANDA.read_text()
+    source = PANDA.with_stem(robot)
+    text = source.read_text().replace(f'urdf = "{robot}.urdf"', f'urdf = "{source.with_suffix(".urdf")}"')
     for key, value in {**bus, **QUICK, "directory": f'"{folder}/logs"', **(changes or {})}.items():
         text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
         assert count == 1, key
@@ -154,11 +157,16 @@ class Rig:
     """Controller and drives on a bus; ends both on leaving."""
 
     def __init__(
-        self, folder: Path, changes: Mapping[str, str] | None = None, can: str = "", lockstep: bool = True
+        self,
+        folder: Path,
+        changes: Mapping[str, str] | None = None,
+        can: str = "",
+        lockstep: bool = True,
+        robot: str = "panda",
     ) -> None:
         self.folder, self.can = folder, can
         self.mode = ["--lockstep"] if lockstep else []
-        self.config = config_at(folder, changes, can)
+        self.config = config_at(folder, changes, can, robot=robot)
         self.console = str(folder / "run" / "panda.sock")
         self.report_path = folder / "report.json"
         self.started: list[Process] = []

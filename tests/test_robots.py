@@ -19,6 +19,7 @@ from rtctl.errors import ConfigError
 from rtctl.types import F64, TOOL_Z, State, Status, Task
 from tests.arms import NO_POINTS
 from tests.lab import ROOT, play, robot
+from tests.rig import Rig, until
 
 NAMES = ("planar4", "puma560", "ur5", "openarm")
 # a, d, alpha, mass, centre of mass and diagonal of the inertia in DH frame i (Corke and Armstrong-Helouvry 1994)
@@ -290,6 +291,17 @@ def test_it_reaches_a_goal_past_an_obstacle_within_every_limit(name: str):
     assert f["min_joint_margin_rad"] > 0.0
     assert run.memory.state == State.RUN
     assert run.memory.in_force == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_driven_by_the_daemon_over_a_bus(name: str, tmp_path: Path):
+    with Rig(tmp_path, robot=name) as rig:
+        rig.drives()
+        rig.controller()
+        rig.arm()
+        assert rig.ask("goal", position_m=RUNS[name][0])["ok"]
+        until(lambda: rig.status()["status"] == "arrived", lambda: f"does not arrive: {rig.status()}")
+        assert rig.status()["faults"] == []
 
 
 @pytest.mark.parametrize("name", ["puma560", "ur5"])
