@@ -75,6 +75,7 @@ def build(config: Config, path: str | Path) -> Robot:
         tau_max=config.safety.torque_ratio * tau_rated,
         tau_rated=tau_rated,
         tau_rate=np.array([j.tau_rate_Nm_s for j in joints]),
+        viscous=np.array([j.friction_Nms_rad for j in joints]),
         tau_lsb=np.array([2.0 * s.t_max / (2**T_BITS - 1) for s in rules.scales(config)]),
         braking=np.array([j.qd_max_rad_s for j in joints]) / config.avoid.joint_braking_s,
         home=home,

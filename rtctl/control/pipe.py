@@ -207,7 +207,8 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
     if command.drive != Drive.TORQUE:
         command = command._replace(tau=np.zeros(robot.n))
     moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
-    qdd = matvec(m.model.A_inv, command.tau - m.model.h - m.model.g) if moving else np.zeros(robot.n)
+    net = command.tau - m.model.h - m.model.g - robot.viscous * m.joints.qd
+    qdd = matvec(m.model.A_inv, net) if moving else np.zeros(robot.n)
     sent = scan.pushed(command.tau, m.sent)
     return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut, pulled=off), command, permitted
 

@@ -43,6 +43,7 @@ class Robot(NamedTuple):
     tau_rated: F64  # (n,) [Nm] rating of the joint
     tau_rate: F64  # (n,) [Nm/s]
     tau_lsb: F64  # (n,) [Nm] rounding of the torque a drive echoes
+    viscous: F64  # (n,) [Nms/rad] friction of the joints, for predictions alone: it damps, so it is not compensated
     braking: F64  # (n,) [rad/s2] with which a joint is brought to rest before its limit
     home: F64  # (n,) [rad]
     q_rest: F64  # (n,) [rad] of the posture task
