@@ -29,6 +29,7 @@ BACK = [0.45, -0.35, 0.45]
 MOVING = 0.15  # [m/s] a tip at this speed is under way
 JOINTS = 7
 IDS = range(1, JOINTS + 1)  # of command frames
+RCVBUFFORCE = 33  # SO_RCVBUFFORCE of Linux: past the kernel's limit, for root
 QUICK = {"self_collision": "false"}  # its preparation takes longer than everything else together
 
 
@@ -57,7 +58,8 @@ class Tap:
         if can:
             self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
             self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            # 14 frames a millisecond fill the kernel's usual buffer in 40 ms, and a busy machine may take that long
+            self.socket.setsockopt(socket.SOL_SOCKET, RCVBUFFORCE, 1 << 24)
             self.socket.bind((bus,))
         else:
             self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

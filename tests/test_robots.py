@@ -13,12 +13,13 @@ from rtctl import config as cfg
 from rtctl.config.report import report
 from rtctl.control.mobility import mobility
 from rtctl.control.osc import operational_space
+from rtctl.control.pipe import tick
 from rtctl.control.robot import Robot
 from rtctl.control.task import selection
 from rtctl.errors import ConfigError
-from rtctl.types import F64, TOOL_Z, State, Status, Task
+from rtctl.types import F64, TOOL_Z, Request, State, Status, Task
 from tests.arms import NO_POINTS
-from tests.lab import ROOT, play, robot
+from tests.lab import ROOT, at_rest, healthy, play, robot
 from tests.rig import Rig, until
 
 NAMES = ("planar4", "puma560", "ur5", "openarm")
@@ -220,6 +221,22 @@ def test_the_plant_accelerates_as_pinocchio_does_with_motors_and_friction(name: 
             np.testing.assert_allclose(got, wanted, rtol=2e-3, atol=2e-2)
     finally:
         plant.close()
+
+
+def test_the_tick_expects_the_acceleration_that_friction_leaves_of_the_torque_it_sent():
+    r = arm("puma560")
+    qd = np.array([0.6, -0.5, 0.7, 1.5, -1.2, 1.0])
+    first = at_rest(r, r.home)
+    gravity = first.model.g
+    running = first._replace(
+        state=State.RUN, sent=np.tile(gravity, (4, 1)), pace=1.0, joints=first.joints._replace(qd=qd)
+    )
+    m, command, _ = tick(r, running, healthy(r.home, 0, qd=qd, tau=gravity), Request())
+    assert m.state == State.RUN
+    wanted = pin.aba(
+        r.body.model, r.body.data, m.joints.q, m.joints.qd, command.tau - PUMA_FRICTION * PUMA_GEARS**2 * m.joints.qd
+    )
+    np.testing.assert_allclose(m.qdd, wanted, rtol=1e-3, atol=1e-3)
 
 
 def put_speed(plant: Plant, q: F64, qd: F64) -> None:

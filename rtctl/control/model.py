@@ -199,6 +199,20 @@ def _assemble(
     return A, A_inv, h, g, x, R, J, Jdqd, P, Jp, B, Lambda_inv
 
 
+@njit(cache=True, fastmath=False)
+def acceleration(A_inv: F64, tau: F64, h: F64, g: F64, viscous: F64, qd: F64) -> F64:
+    """Return qdd (n,) = A^-1 (tau - h - g - B qd), what a torque tau [Nm] makes of a state; NaN where a state is none.
+
+    h, g: (n,) [Nm]; viscous: (n,) [Nms/rad] friction B of the joints; qd: (n,) [rad/s].
+    """
+    out = np.zeros(tau.shape[0])
+    for j in range(tau.shape[0]):
+        net = tau[j] - h[j] - g[j] - viscous[j] * qd[j]
+        for i in range(tau.shape[0]):
+            out[i] += A_inv[i, j] * net
+    return out
+
+
 class RigidBody:
     """One arm: Pinocchio's model reduced to the configured joints, its scratch data and views into it.
 

@@ -13,9 +13,8 @@ from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
 from rtctl.control.law import Law, evaluate_law
 from rtctl.control.limits import Permitted, permit, pulled, slew_reference
-from rtctl.control.linalg import matvec
 from rtctl.control.memory import Memory
-from rtctl.control.model import Model
+from rtctl.control.model import Model, acceleration
 from rtctl.control.osc import OperationalSpace, operational_space
 from rtctl.control.record import make_record
 from rtctl.control.robot import Robot
@@ -207,8 +206,9 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
     if command.drive != Drive.TORQUE:
         command = command._replace(tau=np.zeros(robot.n))
     moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
-    net = command.tau - m.model.h - m.model.g - robot.viscous * m.joints.qd
-    qdd = matvec(m.model.A_inv, net) if moving else np.zeros(robot.n)
+    qdd = np.zeros(robot.n)
+    if moving:
+        qdd = acceleration(m.model.A_inv, command.tau, m.model.h, m.model.g, robot.viscous, m.joints.qd)
     sent = scan.pushed(command.tau, m.sent)
     return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut, pulled=off), command, permitted
 
