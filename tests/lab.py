@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from firmware_sim.simulator import open_simulator
@@ -290,6 +291,8 @@ def same(a: Any, b: Any) -> bool:
     """Return whether two values, however nested, agree to the bit."""
     if isinstance(a, np.ndarray):
         return isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, Memory) and isinstance(b, Memory):
+        return same(astuple(a), astuple(b))
     if isinstance(a, tuple | list):
         return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, float | np.floating):
@@ -299,6 +302,8 @@ def same(a: Any, b: Any) -> bool:
 
 def leaves(value: Any, visit: Callable[[NDArray[Any]], None]) -> None:
     """Call `visit` with every array inside nested tuples."""
+    if isinstance(value, Memory):
+        value = astuple(value)
     if isinstance(value, np.ndarray):
         visit(value)
     elif isinstance(value, tuple | list):

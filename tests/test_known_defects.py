@@ -154,10 +154,10 @@ def test_avoidance_goes_before_the_goal(monkeypatch: Patch):
 
     def in_the_null_space(*arguments: Any) -> Any:
         out, space = true_law(*arguments), arguments[5]
-        torques = out[1]  # motion, posture, obstacles, limits, drive, keep
-        projected = space.NT @ torques[2]
-        torques[5] += projected - torques[2]
-        torques[2] = projected
+        torques = out[1]
+        projected = space.NT @ torques[law.OBSTACLES]
+        torques[law.KEEP] += projected - torques[law.OBSTACLES]
+        torques[law.OBSTACLES] = projected
         return out
 
     monkeypatch.setattr(law, "_evaluate", in_the_null_space)

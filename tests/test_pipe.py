@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import astuple
 
 from rtctl import config as cfg
 from rtctl.control.memory import Memory
@@ -54,7 +55,7 @@ def everything(value: tuple[Memory, Command, Record]) -> bytes:
     """Return all bytes of what a tick gave."""
     found: list[bytes] = []
     leaves(value, lambda a: found.append(a.tobytes()))
-    return b"".join(found) + repr([v for v in value[0] if not isinstance(v, np.ndarray | tuple)]).encode()
+    return b"".join(found) + repr([v for v in astuple(value[0]) if not isinstance(v, np.ndarray | tuple)]).encode()
 
 
 def test_equal_inputs_give_equal_bits():

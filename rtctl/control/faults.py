@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from rtctl.control import notice
+from rtctl.control.scan import any_set
 from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
 JUMP_WINDOW = 50  # cycles in which a second jump makes a fault of a glitch
@@ -85,8 +87,6 @@ _BY_LINK = tuple(
         (Link.LOG_DEGRADED, "log_degraded"),
     )
 )
-# What `_scan` sees at some joint.
-_UNHEARD, _FAULT, _DISABLED, _TORQUE, _OUTSIDE, _FAST, _NOT_FINITE = (1 << i for i in range(7))
 
 
 class SafetyParams(NamedTuple):
@@ -105,21 +105,19 @@ class SafetyParams(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What the pipe tells the detectors beside the feedback."""
+    """What the pipe tells the detectors beside the link's flags."""
 
+    seen: int  # flags of `notice`
+    age: float  # [s] oldest reply of a joint
+    feed_age: float  # [s] oldest observation of a moving obstacle
+    missed: int  # slots
     active: bool  # drives are meant to be enabled
     powered: bool  # torque flows, or is being switched on
-    torque_low: F64  # (n,) [Nm] smallest of the torques the echo may answer to
-    torque_high: F64  # (n,) [Nm] largest of them
     jumped: bool  # a joint's position was dropped: further than it can have moved
-    stuck: bool  # an encoder repeats itself; see `watch`
-    disagree: bool  # a joint's positions and speed disagree
     pulled: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
-    contact: bool
-    goal_inside: bool
-    feed_age: float  # [s] oldest observation of a moving obstacle
+    has_goal: bool
     innovation: float
 
 
@@ -152,76 +150,54 @@ def jumped(
     return out
 
 
-@njit(cache=True, fastmath=False)
-def _scan(
-    q: F64, qd: F64, tau: F64, age: F64, drive: I64, torque_low: F64, torque_high: F64, torque_tolerance: F64,
-    q_min: F64, q_max: F64, qd_max: F64, limit_tolerance: float, speed_tolerance: float,
-) -> tuple[float, int]:  # fmt: skip
-    """Return the greatest age [s] and what was seen at any joint."""
-    oldest, seen = 0.0, 0
-    for i in range(q.shape[0]):
-        oldest = age[i] if age[i] > oldest else oldest
-        if drive[i] < 0:
-            seen |= _UNHEARD
-        if drive[i] > 1:
-            seen |= _FAULT
-        if drive[i] == 0:
-            seen |= _DISABLED
-        if tau[i] < torque_low[i] - torque_tolerance[i] or tau[i] > torque_high[i] + torque_tolerance[i]:
-            seen |= _TORQUE
-        if q[i] < q_min[i] - limit_tolerance or q[i] > q_max[i] + limit_tolerance:
-            seen |= _OUTSIDE
-        if abs(qd[i]) > speed_tolerance * qd_max[i]:
-            seen |= _FAST
-        if not (np.isfinite(q[i]) and np.isfinite(qd[i]) and np.isfinite(tau[i])):
-            seen |= _NOT_FINITE
-    return oldest, seen
-
-
-def detect(
-    feedback: Feedback, e: Evidence, c: Counters, p: SafetyParams, qd_max: F64, q_min: F64, q_max: F64, dt: float
-) -> tuple[int, Counters]:
-    """Return the bits of the faults present at this tick and the counters for the next."""
-    f, link = feedback, feedback.link
-    age, seen = _scan(
-        f.q, f.qd, f.tau, f.age, f.drive, e.torque_low, e.torque_high, p.torque_tolerance,
-        q_min, q_max, qd_max, p.limit_tolerance, p.speed_tolerance,
-    )  # fmt: skip
+def detect(link: int, e: Evidence, c: Counters, p: SafetyParams, dt: float) -> tuple[int, Counters]:
+    """Return the bits of the faults present at this tick and the counters for the next; link: types.Link of it."""
+    seen, active = e.seen, e.active
     half = 0.5 * dt  # ages are whole periods; half a one keeps rounding out of the comparison
     n = Counters(
-        corrupt_window=((c.corrupt_window << 1) | bool(link & _CORRUPT)) & 0x3FF,
-        send_failed=c.send_failed + 1 if link & _SEND_FAILED else 0,
-        disabled=c.disabled + 1 if e.active and seen & _DISABLED else 0,
-        mismatch=c.mismatch + 1 if e.active and seen & _TORQUE else 0,
-        pulled=c.pulled + 1 if e.active and e.pulled and not link & _DERATED else 0,
-        jumps=((c.jumps << 1) | e.jumped) & ((1 << JUMP_WINDOW) - 1) if e.active else 0,
-        missed=c.missed + 1 if f.missed else 0,
-        innovation=c.innovation + 1 if e.active and not e.innovation <= p.innovation_max else 0,
+        ((c.corrupt_window << 1) | bool(link & _CORRUPT)) & 0x3FF,
+        c.send_failed + 1 if link & _SEND_FAILED else 0,
+        c.disabled + 1 if active and seen & notice.DISABLED else 0,
+        c.mismatch + 1 if active and seen & notice.TORQUE else 0,
+        c.pulled + 1 if active and e.pulled and not link & _DERATED else 0,
+        ((c.jumps << 1) | e.jumped) & ((1 << JUMP_WINDOW) - 1) if active else 0,
+        c.missed + 1 if e.missed else 0,
+        c.innovation + 1 if active and not e.innovation <= p.innovation_max else 0,
     )
     present = {
-        "feedback_stale": age > p.stale_periods * dt + half,
-        "feedback_lost": age > p.lost_periods * dt + half or seen & _UNHEARD,
+        "feedback_stale": e.age > p.stale_periods * dt + half,
+        "feedback_lost": e.age > p.lost_periods * dt + half or seen & notice.UNHEARD,
         "corrupt_frames": n.corrupt_window.bit_count() >= 3,
         "send_failed": n.send_failed >= 2,
-        "drive_fault": seen & _FAULT,
+        "drive_fault": seen & notice.FAULT,
         "drive_disabled": n.disabled >= 5,
         "torque_mismatch": n.mismatch >= 5 or n.pulled >= 5,
-        "encoder_stuck": e.stuck,
-        "velocity_mismatch": e.disagree,
+        "encoder_stuck": seen & notice.STUCK,
+        "velocity_mismatch": seen & notice.DISAGREE,
         "encoder_jump": n.jumps.bit_count() >= 2,
-        "not_finite": e.not_finite or seen & _NOT_FINITE,
-        "deadline": e.powered and (n.missed >= 3 or f.missed >= 10),
-        "goal_in_obstacle": e.goal_inside,
-        "contact": e.contact and e.active,
+        "not_finite": e.not_finite or seen & notice.NOT_FINITE,
+        "deadline": e.powered and (n.missed >= 3 or e.missed >= 10),
+        "goal_in_obstacle": e.has_goal and seen & notice.GOAL_INSIDE,
+        "contact": active and seen & notice.CONTACT,
         "feed_stale": e.feed_age > p.feed_timeout,
-        "outside_limits": seen & _OUTSIDE and e.active and not e.armed_outside,
-        "overspeed": seen & _FAST and e.active,
+        "outside_limits": active and seen & notice.OUTSIDE and not e.armed_outside,
+        "overspeed": active and seen & notice.FAST,
         "innovation": n.innovation >= 5,
     }
-    bits = sum(BIT[name] for name, here in present.items() if here)
+    bits = 0
+    if any(present.values()):
+        bits = sum(BIT[name] for name, here in present.items() if here)
     if link:
         bits |= sum(bit for flag, bit in _BY_LINK if link & flag)
     return bits, n
+
+
+@njit(cache=True, fastmath=False)
+def any_jumped(
+    q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
+) -> bool:
+    """Return whether `jumped` is true of any joint."""
+    return any_set(jumped(q, age, replies, q_previous, age_previous, qd_max, elapsed, dt))
 
 
 def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:

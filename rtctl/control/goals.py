@@ -4,7 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
+from rtctl.control.estimator import TipEstimate
+from rtctl.control.scan import norm
+from rtctl.control.task import selected, task_error
 from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
@@ -17,6 +21,20 @@ class Progress(NamedTuple):
     error_rot: float  # [rad], 0 for a position task
     speed: float  # [m/s] of the tip
     rate: float  # [rad/s] of the tip, 0 for a position task
+
+
+@njit(cache=True, fastmath=False)
+def _progress(
+    task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64, xd: F64, omega: F64
+) -> tuple[float, float, float, float]:
+    e, e_rot = task_error(task, axis, position, wxyz, x, R)
+    v, w = selected(task, axis, R, xd, omega)
+    return norm(e), norm(e_rot), norm(v), norm(w)
+
+
+def progress(goal: Goal, tip: TipEstimate) -> Progress:
+    """Return how far the tip is from a goal and how fast it is, along what the goal constrains."""
+    return Progress(*_progress(int(goal.task), goal.axis, goal.position, goal.wxyz, tip.x, tip.R, tip.xd, tip.omega))
 
 
 def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str, ...]) -> str:

@@ -17,29 +17,91 @@ from rtctl.control.model import Model
 from rtctl.control.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
 from rtctl.control.primitives import Obstacles
 from rtctl.control.robot import JOINTS_MAX, Robot
-from rtctl.types import F64, I64, Cut, Record
+from rtctl.types import F64, I32, I64, Cut, Record
 
 _CAP, _SPEED, _SINGULAR = (int(c) for c in (Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR))
 _SCALED = int(Cut.MOTION_SCALED)
 
 
-class Law(NamedTuple):
-    """The torques [Nm], all (n,), and what the field saw."""
+# rows of Law.torques, (7, n) [Nm]; the first five as the record has them
+MOTION = 0
+OBSTACLES = 1  # self-collision included
+LIMITS = 2  # of joint position and speed
+POSTURE = 3
+LOAD = 4  # h + g
+DRIVE = 5  # pursues the goal or the posture
+KEEP = 6  # dissipates, repels, carries
 
-    F: F64  # (6,) [m/s2, rad/s2] F*_m
-    v_ref: F64  # (3,) [m/s]
-    w_ref: F64  # (3,) [rad/s]
-    tau_motion: F64
-    tau_posture: F64
-    tau_obstacles: F64  # self-collision included
-    tau_limits: F64  # of joint position and speed
-    drive: F64  # pursues the goal or the posture
-    keep: F64  # dissipates, repels, carries
-    rho: F64  # (K,) [m] smallest distance of any PSP, inf where there is no obstacle
-    force: F64  # (K, 3) [N]
-    nearest: I64  # (K,) PSP
+
+class Law(NamedTuple):
+    """The torques [Nm], and what the field saw."""
+
+    task: F64  # (12,) F, v_ref, w_ref below
+    torques: F64  # (7, n) [Nm] the rows above
+    seen: F64  # (4 K,) rho, then force, below
+    nearest: I32  # (K,) PSP
     rho_self: float  # [m]
     cut: int  # Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR, Cut.MOTION_SCALED
+
+    def row(self, i: int) -> F64:
+        """Return a row (n,) [Nm] of the torques."""
+        row: F64 = self.torques[i]
+        return row
+
+    @property
+    def F(self) -> F64:
+        """F*_m (6,) [m/s2, rad/s2]."""
+        return self.task[:6]
+
+    @property
+    def v_ref(self) -> F64:
+        """(3,) [m/s] of this tick."""
+        return self.task[6:9]
+
+    @property
+    def w_ref(self) -> F64:
+        """(3,) [rad/s] of this tick."""
+        return self.task[9:]
+
+    @property
+    def rho(self) -> F64:
+        """(K,) [m] smallest distance of any PSP, inf where there is no obstacle."""
+        return self.seen[: self.nearest.shape[0]]
+
+    @property
+    def force(self) -> F64:
+        """(K, 3) [N] on the arm."""
+        return self.seen[self.nearest.shape[0] :].reshape(-1, 3)
+
+    @property
+    def tau_motion(self) -> F64:
+        """(n,) [Nm], as are the rows that follow."""
+        return self.row(MOTION)
+
+    @property
+    def tau_posture(self) -> F64:
+        """Row POSTURE."""
+        return self.row(POSTURE)
+
+    @property
+    def tau_obstacles(self) -> F64:
+        """Row OBSTACLES."""
+        return self.row(OBSTACLES)
+
+    @property
+    def tau_limits(self) -> F64:
+        """Row LIMITS."""
+        return self.row(LIMITS)
+
+    @property
+    def drive(self) -> F64:
+        """Row DRIVE."""
+        return self.row(DRIVE)
+
+    @property
+    def keep(self) -> F64:
+        """Row KEEP."""
+        return self.row(KEEP)
 
 
 @njit(cache=True, fastmath=False)
@@ -88,15 +150,10 @@ def evaluate_law(
     q_rest (n,) the posture; pace: the fraction of qd_max that joints may have. e = e_rot = 0 with nonzero references
     brakes along the path.
     """
-    task, torques, rho, force, nearest, rho_own, cut = _evaluate(
+    return Law(*_evaluate(
         robot.constants, robot.points.radius, robot.points.link, robot.scratch,
         model, space, obstacles, q, qd, xd, omega, e, e_rot, v_ref, w_ref, q_rest, pace,
-    )  # fmt: skip
-    motion, posture, field_torque, limits, drive, keep = torques
-    return Law(
-        task[:6], task[6:9], task[9:], motion, posture, field_torque, limits, drive, keep,
-        rho, force, nearest, rho_own, cut,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def prepared(robot: Robot) -> Robot:
@@ -152,8 +209,8 @@ def _evaluate(
     constants: Record, radius: F64, link: I64, seen: Field,
     model: Model, space: OperationalSpace, obstacles: Obstacles, q: F64, qd: F64, xd: F64, omega: F64,
     e: F64, e_rot: F64, v_ref: F64, w_ref: F64, q_rest: F64, pace: float,
-) -> tuple[F64, F64, F64, F64, I64, float, int]:  # fmt: skip
-    """Return F, v_ref and w_ref in a row (12,), the torques of `Law` (6, n), and its other fields.
+) -> tuple[F64, F64, F64, I32, float, int]:  # fmt: skip
+    """Return the fields of `Law`.
 
     One compiled call with few results: crossing the border costs as much as a term, and a tenth of that per array.
     """
@@ -197,9 +254,10 @@ def _evaluate(
     cut |= _SPEED if guards else 0
     cut |= _SINGULAR if space.damped else 0
     cut |= _SCALED if share < 1.0 else 0
-    torques = np.empty((6, q.shape[0]))
-    torques[0], torques[1] = share * tau_drive + tau_brake, share * tau_rest + tau_damp
-    torques[2], torques[3] = tau_obstacles, tau_limits + tau_guard
-    torques[4], torques[5] = drive, load + keep + tau_guard
+    torques = np.empty((7, n))
+    torques[MOTION], torques[POSTURE] = share * tau_drive + tau_brake, share * tau_rest + tau_damp
+    torques[OBSTACLES], torques[LIMITS], torques[LOAD] = tau_obstacles, tau_limits + tau_guard, load
+    torques[DRIVE], torques[KEEP] = drive, load + keep + tau_guard
     task = np.concatenate((F, v, w))
-    return task, torques, seen.rho_min.copy(), seen.force.copy(), seen.nearest.copy(), rho_own, cut
+    seen_by = np.concatenate((seen.rho_min, seen.force.copy().reshape(-1)))
+    return task, torques, seen_by, seen.nearest.astype(np.int32), rho_own, cut

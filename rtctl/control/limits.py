@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from rtctl.control.model import acceleration
+from rtctl.control.scan import largest
 from rtctl.types import F64, Cut
 
 _NON_FINITE, _MAGNITUDE, _SLEW, _SCALED = (int(c) for c in (Cut.NON_FINITE, Cut.MAGNITUDE, Cut.SLEW, Cut.MOTION_SCALED))
@@ -114,3 +116,30 @@ def permit(
     damping (n,) [Nms/rad] of the fallback -D qd when anything is not finite, dt [s].
     """
     return Permitted(*_permit(drive, keep, qd, reference, tau_max, tau_rate, damping, dt))
+
+
+@njit(cache=True, fastmath=False)
+def command_torque(
+    drive: F64, keep: F64, qd: F64, sent: F64, echo: F64, age: F64, tau_max: F64, tau_rate: F64, tau_lsb: F64, D: F64,
+    A_inv: F64, h: F64, g: F64, viscous: F64, dt: float, torque: bool, moving: bool,
+) -> tuple[F64, int, float, bool]:  # fmt: skip
+    """Return what goes out this tick, with all that follows from it, in one compiled call.
+
+    drive, keep, qd, tau_max, tau_rate, D: of `permit`. sent: (4, n) [Nm] the last commands, newest first. echo (n,)
+    [Nm], age (n,) [s]: what the drives say they apply, and since when. A_inv, h, g, viscous: of `acceleration`.
+    torque: whether the drives are asked for torque at all. moving: whether the arm is free to move by it.
+    Rows (6, n): tau_wanted, the commands with this one before them, and the acceleration to expect; then Cut bits, the
+    scale of `Permitted`, and whether the slew starts from the echo because the drive does not follow.
+    """
+    n = drive.shape[0]
+    lag = max(1, round(largest(age) / dt))
+    reference = slew_reference(sent[0], echo, tau_rate, tau_lsb, dt, lag)
+    rows = np.zeros((6, n))
+    wanted, tau, cut, scale = _permit(drive, keep, qd, reference, tau_max, tau_rate, D, dt)
+    rows[0] = wanted
+    if torque:
+        rows[1] = tau
+    rows[2:5] = sent[:3]
+    if moving:
+        rows[5] = acceleration(A_inv, rows[1], h, g, viscous, qd)
+    return rows, cut, scale, pulled(reference, sent[0], tau_lsb)

@@ -11,12 +11,12 @@ from rtctl.control.escape import Escape
 from rtctl.control.estimator import held, joint_start, joint_step, start, tip_step, update_pose
 from rtctl.control.faults import FAULTS, Counters, severity
 from rtctl.control.goals import Progress
-from rtctl.control.law import Law, evaluate_law
-from rtctl.control.limits import Permitted, permit, pulled, slew_reference
+from rtctl.control.law import LOAD, Law, evaluate_law
+from rtctl.control.limits import Permitted, command_torque
 from rtctl.control.memory import Memory
-from rtctl.control.model import Model, acceleration
+from rtctl.control.model import Model
 from rtctl.control.osc import OperationalSpace, operational_space
-from rtctl.control.record import make_record
+from rtctl.control.record import Tail, make_record
 from rtctl.control.robot import Robot
 from rtctl.control.session import (
     REST_HOLD,
@@ -30,7 +30,7 @@ from rtctl.control.session import (
     with_goal,
 )
 from rtctl.control.so3 import exp3, quat_of
-from rtctl.control.task import between, error_of, point_of, selected, selection, task_error
+from rtctl.control.task import between, point_of, selected, selection, task_error, wholly_placed
 from rtctl.types import (
     F64,
     TOOL_Z,
@@ -71,9 +71,11 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     m = supervised(robot, m, feedback, request, present)
     m = with_goal(robot, m, request)
     m, law = _law(robot, m)
-    m, command, permitted = _commanded(robot, m, feedback, law)
-    m = _diagnosed(robot, m, law, permitted)
-    return m, command, _record(robot, m, feedback, request, law, permitted, command)
+    m, command, permitted, out = _commanded(robot, m, feedback, law)
+    pursued = m.goal if m.goal is not None and m.state == State.RUN else m.hold
+    p = goals.progress(pursued, m.tip)
+    m = _diagnosed(robot, m, law, permitted, p)
+    return m, command, _record(robot, m, feedback, request.verb, law, p, out, command.drive)
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
@@ -133,7 +135,9 @@ def _perceived(robot: Robot, m: Memory, request: Request, elapsed: float) -> Mem
     table, verdict = world.advanced(m.world, elapsed), m.verdict
     if request.obstacles:
         table, verdict = world.edited(table, request.obstacles)
-    rho = m.goal_rho if m.goal is None else world.distance_from(table, point_of(m.goal, m.tip.x))
+    rho, goal = m.goal_rho, m.goal
+    if goal is not None and (table is not m.world or not wholly_placed(goal)):
+        rho = world.distance_from(table, point_of(goal, m.tip.x))
     return m._replace(world=table, verdict=verdict, goal_rho=rho)
 
 
@@ -190,27 +194,24 @@ def _pace(robot: Robot, m: Memory) -> float:
     return START_PACE if m.state == State.ARMED or m.recovering else min(1.0, m.pace + robot.dt / START_TIME)
 
 
-def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[Memory, Command, Permitted]:
-    """Turn the law's torque into what the drives are asked for, through the permitter."""
+def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[Memory, Command, Permitted, F64]:
+    """Turn the law's torque into what the drives are asked for, through the permitter; also wanted and sent (2, n)."""
     drive, keep = law.drive, law.keep
     if m.state == State.SAFE_STOP and m.reaction >= Severity.SS1:  # damp -D qd + g, then torque off
         over = (m.tick - m.since) * robot.dt >= robot.stop.time or m.rest * robot.dt >= REST_HOLD
         m = m._replace(off=m.off or over)
         fresh = feedback.age <= robot.safety.lost_periods * robot.dt  # a velocity that old damps nothing
         drive, keep = np.zeros(robot.n), m.model.g - robot.stop.damping * m.joints.qd * fresh
-    lag = max(1, round(scan.largest(feedback.age) / robot.dt))
-    reference = slew_reference(m.sent[0], feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, lag)
-    off = pulled(reference, m.sent[0], robot.tau_lsb)
-    permitted = permit(drive, keep, m.joints.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt)
-    command = Command(_asked_of_drives(m, feedback), permitted.tau)
-    if command.drive != Drive.TORQUE:
-        command = command._replace(tau=np.zeros(robot.n))
-    moving = command.drive == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
-    qdd = np.zeros(robot.n)
-    if moving:
-        qdd = acceleration(m.model.A_inv, command.tau, m.model.h, m.model.g, robot.viscous, m.joints.qd)
-    sent = scan.pushed(command.tau, m.sent)
-    return m._replace(sent=sent, qdd=qdd, cut=permitted.cut | law.cut, pulled=off), command, permitted
+    asked = _asked_of_drives(m, feedback)
+    moving = asked == Drive.TORQUE and m.state != State.ARMED  # in ARMED brakes may still hold the arm
+    rows, cut, scale, off = command_torque(
+        drive, keep, m.joints.qd, m.sent, feedback.tau, feedback.age, robot.tau_max, robot.tau_rate, robot.tau_lsb,
+        robot.stop.damping, m.model.A_inv, m.model.h, m.model.g, robot.viscous, robot.dt, asked == Drive.TORQUE, moving,
+    )  # fmt: skip
+    sent = rows[1:5]
+    permitted = Permitted(rows[0], sent[0], cut, scale)
+    m = m._replace(sent=sent, qdd=rows[5], cut=cut | law.cut, pulled=off)
+    return m, Command(asked, sent[0]), permitted, rows[:2]
 
 
 def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
@@ -224,12 +225,11 @@ def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
     return Drive.DISABLE
 
 
-def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted) -> Memory:
+def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progress) -> Memory:
     """Level of competence: what the arm is doing about its goal, and once it rests, what holds it."""
     goal = m.goal
     if goal is None or m.state != State.RUN:
         return m if m.status == Status.NO_GOAL else free_of_goals(m)
-    p = _progress(m, goal)
     if goals.arrived(p, goal):
         return _with_status(m, Status.ARRIVED)._replace(escape=Escape(), still=m.still + 1)
     if m.escape.active or m.escape.phase == escape.Phase.CHOOSING:
@@ -266,32 +266,18 @@ def _caught(robot: Robot, m: Memory, law: Law, permitted: Permitted, goal: Goal,
     return _with_held(robot, m, law, found)._replace(escape=begun, status=Status.ESCAPING)
 
 
-def _progress(m: Memory, goal: Goal) -> Progress:
-    error, error_rot = error_of(goal, m.tip.x, m.tip.R)
-    v, w = selected(int(goal.task), goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
-    return Progress(error, error_rot, scan.norm(v), scan.norm(w))
-
-
 def _record(
-    robot: Robot, m: Memory, feedback: Feedback, request: Request, law: Law, permitted: Permitted, command: Command
+    robot: Robot, m: Memory, feedback: Feedback, verb: Verb, law: Law, p: Progress, out: F64, drive: Drive
 ) -> Record:
-    """Write everything that came in and went out into one struct."""
+    """Write everything that came in and went out into one struct; out: (2, n) [Nm] wanted and sent."""
     goal = m.goal if m.goal is not None else m.hold
-    error, error_rot = error_of(goal, m.tip.x, m.tip.R)
     return make_record(
-        robot.n, robot.slots,
-        tick=m.tick, slot=feedback.slot, time=feedback.slot * robot.dt, missed=feedback.missed, link=feedback.link,
-        q=feedback.q, qd=feedback.qd, tau_measured=feedback.tau, age=feedback.age, replies=feedback.replies,
-        drive=feedback.drive, verb=request.verb, lateness=feedback.lateness, compute=feedback.compute,
-        x=m.tip.x, xd=m.tip.xd, wxyz=quat_of(m.tip.R), omega=m.tip.omega, innovation=m.innovation,
-        goal=goal.position, goal_wxyz=goal.wxyz, goal_axis=goal.axis, task=goal.task, F=law.F,
-        error=error, error_rot=error_rot, sigma_min=m.space.sigma_min,
-        rho=law.rho, force=law.force, point=law.nearest, tau_motion=law.tau_motion,
-        tau_obstacles=law.tau_obstacles, tau_limits=law.tau_limits, tau_posture=law.tau_posture,
-        tau_gravity=m.model.g + m.model.h, tau_wanted=permitted.tau_wanted, tau_sent=command.tau,
-        command=command.drive, cut=m.cut, state=m.state, status=m.status, blocker=m.blocker, holders=m.holders,
-        escape=m.escape.phase, severity=m.reaction,
-        faults=m.in_force, model_evaluated=m.evaluated,
+        robot.n, robot.slots, m.tick, feedback.slot * robot.dt, feedback, verb, m.tip, m.innovation, goal, law.F,
+        (p.error, p.error_rot, m.space.sigma_min), law.seen, law.nearest,
+        law.torques[: LOAD + 1], out,
+        Tail(
+            drive, m.cut, m.state, m.status, m.blocker, m.holders, m.escape.phase, m.reaction, m.in_force, m.evaluated
+        ),
     )  # fmt: skip
 
 

@@ -213,12 +213,12 @@ def without(obstacles: Obstacles, slot: int) -> Obstacles:
 
 def advance(obstacles: Obstacles, dt: float) -> Obstacles:
     """Return the obstacles moved on by their own velocities for dt [s]: p + v dt, exp(w dt) R."""
-    p, R = _advanced(obstacles.active, obstacles.p, obstacles.R, obstacles.v, obstacles.w, dt)
+    p, R = advanced_pose(obstacles.active, obstacles.p, obstacles.R, obstacles.v, obstacles.w, dt)
     return obstacles._replace(p=p, R=R)
 
 
 @njit(cache=True, fastmath=False)
-def _advanced(active: B1, p: F64, R: F64, v: F64, w: F64, dt: float) -> tuple[F64, F64]:
+def advanced_pose(active: B1, p: F64, R: F64, v: F64, w: F64, dt: float) -> tuple[F64, F64]:
     """Return new (p, R) of the active slots; the others are carried over."""
     p, R = p.copy(), R.copy()
     for k in range(active.shape[0]):

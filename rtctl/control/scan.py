@@ -27,15 +27,6 @@ def any_below(values: F64, bound: float) -> bool:
 
 
 @njit(cache=True, fastmath=False)
-def any_outside(values: F64, low: F64, high: F64) -> bool:
-    """Return whether any value is below its low or above its high bound; a NaN is not."""
-    for i in range(values.shape[0]):
-        if values[i] < low[i] or values[i] > high[i]:
-            return True
-    return False
-
-
-@njit(cache=True, fastmath=False)
 def all_equal(values: I64, wanted: int) -> bool:
     """Return whether every value is the wanted one."""
     for i in range(values.shape[0]):
@@ -45,40 +36,11 @@ def all_equal(values: I64, wanted: int) -> bool:
 
 
 @njit(cache=True, fastmath=False)
-def any_faster(speeds: F64, bound: float) -> bool:
-    """Return whether any magnitude is above the bound; a NaN is not."""
-    for i in range(speeds.shape[0]):
-        if abs(speeds[i]) > bound:
-            return True
-    return False
-
-
-@njit(cache=True, fastmath=False)
 def largest(values: F64) -> float:
     """Return the largest value; a NaN is passed over unless it comes first."""
     out: float = values[0]
     for i in range(1, values.shape[0]):
         out = max(out, values[i])
-    return out
-
-
-@njit(cache=True, fastmath=False)
-def span(rows: F64) -> tuple[F64, F64]:
-    """Return the least and the largest of each column of (r, c), both (c,)."""
-    low, high = rows[0].copy(), rows[0].copy()
-    for r in range(1, rows.shape[0]):
-        for c in range(rows.shape[1]):
-            low[c] = min(low[c], rows[r, c])
-            high[c] = max(high[c], rows[r, c])
-    return low, high
-
-
-@njit(cache=True, fastmath=False)
-def pushed(row: F64, rows: F64) -> F64:
-    """Return `rows` (r, c) with `row` (c,) put before them and the last one gone."""
-    out = np.empty_like(rows)
-    out[0] = row
-    out[1:] = rows[:-1]
     return out
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rtctl.control import faults, goals, scan, supervisor, task, watch, world
+from rtctl.control import faults, goals, notice, scan, supervisor, task, world
 from rtctl.control.escape import Escape
 from rtctl.control.faults import BIT, Evidence
 from rtctl.control.memory import Memory
@@ -46,11 +46,10 @@ def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, boo
     if not drives_torque(m) or m.state == State.ARMED:
         return feedback, False
     elapsed = robot.dt * (1 + feedback.missed)
-    odd = faults.jumped(
-        feedback.q, feedback.age, feedback.replies, m.q_previous, m.age_previous, robot.qd_max, elapsed, robot.dt
-    )
-    if not scan.any_set(odd):
+    args = (feedback.q, feedback.age, feedback.replies, m.q_previous, m.age_previous, robot.qd_max, elapsed, robot.dt)
+    if not faults.any_jumped(*args):
         return feedback, False
+    odd = faults.jumped(*args)
     silent = np.minimum(m.age_previous + elapsed, robot.safety.lost_periods * robot.dt)
     return feedback._replace(
         q=np.where(odd, m.q_previous, feedback.q),
@@ -59,41 +58,25 @@ def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, boo
     ), True
 
 
-def _watched(robot: Robot, m: Memory, feedback: Feedback) -> tuple[watch.Watch, bool, bool]:
-    f, safety = feedback, robot.safety
-    elapsed = robot.dt * (1 + f.missed)
-    return watch.watched(
-        m.watch, f.q, f.qd, f.age, f.replies, m.q_previous, m.age_previous, m.qdd, m.model.A, safety.friction,
-        safety.velocity_tolerance, elapsed, robot.dt,
-    )  # fmt: skip
-
-
 def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple[Memory, int]:
     """Return the memory with the faults in force, and the bits of those present now; what jumped is in no feedback."""
-    low, high = scan.span(m.sent)
-    active = drives_torque(m) and m.state != State.ARMED
-    seen, stuck, disagree = _watched(robot, m, feedback) if active else (watch.fresh(robot.n), False, False)
+    f, safety = feedback, robot.safety
+    powered = drives_torque(m)
+    active = powered and m.state != State.ARMED
+    watch, age, feed_age, seen = notice.notice(
+        m.watch, active, f.q, f.qd, f.tau, f.age, f.replies, f.drive, m.sent, m.q_previous, m.age_previous, m.qdd,
+        m.model.A, m.rho, m.goal_rho, m.world.age, m.world.moving, safety.torque_tolerance, safety.friction,
+        safety.velocity_tolerance, safety.limit_tolerance, safety.speed_tolerance, REST_SPEED, robot.q_min, robot.q_max,
+        robot.qd_max, robot.dt * (1 + f.missed), robot.dt,
+    )  # fmt: skip
+    lost = bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation)
     evidence = Evidence(
-        active=active,
-        powered=drives_torque(m),
-        torque_low=low,
-        torque_high=high,
-        jumped=jumped,
-        stuck=stuck,
-        disagree=disagree,
-        pulled=m.pulled,
-        armed_outside=m.recovering,
-        not_finite=bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation),
-        contact=scan.any_below(m.rho, 0.0),
-        goal_inside=m.goal is not None and scan.any_below(m.goal_rho, 0.0),
-        feed_age=world.oldest(m.world),
-        innovation=m.innovation,
-    )
-    present, counters = faults.detect(
-        feedback, evidence, m.counters, robot.safety, robot.qd_max, robot.q_min, robot.q_max, robot.dt
-    )
+        seen, age, feed_age, f.missed, active, powered, jumped, m.pulled, m.recovering, lost, m.goal is not None,
+        m.innovation,
+    )  # fmt: skip
+    present, counters = faults.detect(f.link, evidence, m.counters, safety, robot.dt)
     in_force, good = faults.latch(present, m.in_force, m.good)
-    outside = scan.any_outside(feedback.q, robot.q_min, robot.q_max)
+    outside = bool(seen & notice.BEYOND)
     m = m._replace(
         counters=counters,
         in_force=in_force,
@@ -102,8 +85,8 @@ def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple
         age_previous=feedback.age,
         outside=outside,
         recovering=m.recovering and outside,
-        watch=seen,
-        rest=0 if scan.any_faster(feedback.qd, REST_SPEED) else m.rest + 1,
+        watch=watch,
+        rest=0 if seen & notice.STIRS else m.rest + 1,
     )
     return m, present
 

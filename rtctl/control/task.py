@@ -134,7 +134,14 @@ def turns(task: Task) -> bool:
 def point_of(goal: Goal, free: F64) -> F64:
     """Return the goal's position (3,) [m] with the coordinates that its task leaves out taken from `free` (3,)."""
     bits = int(goal.task)
+    if bits & _POSITION == _POSITION:
+        return goal.position
     return np.array([goal.position[i] if bits >> i & 1 else free[i] for i in range(3)])
+
+
+def wholly_placed(goal: Goal) -> bool:
+    """Return whether the goal constrains all three coordinates of the tip."""
+    return int(goal.task) & _POSITION == _POSITION
 
 
 def within(task: Task, axes: Task) -> tuple[Task, str]:

@@ -5,8 +5,6 @@ model, so only torque beyond what the drives themselves may be wrong by counts, 
 joints move: an arm that stands as a whole is held. What it pushes against is for the innovation to say.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
@@ -20,28 +18,31 @@ SHARE = 0.1  # of a new difference of speeds in the filtered one: 10 ticks
 DISAGREE_TICKS = 10  # for which that must lie beyond its bound
 
 
-class Watch(NamedTuple):
-    """What has been noticed of each joint, all (n,)."""
-
-    equal: F64  # [s] for which the position has been the same to the bit
-    speed: F64  # [rad/s] that the joint should have
-    travel: F64  # [rad] that it should have come in that time
-    residual: F64  # [rad/s] filtered: speed by the positions less the speed reported
-    odd: I64  # ticks for which the residual has been beyond its bound
+# rows of what has been noticed of each joint, (5, n)
+EQUAL = 0  # [s] for which the position has been the same to the bit
+SPEED = 1  # [rad/s] that the joint should have
+TRAVEL = 2  # [rad] that it should have come in that time
+RESIDUAL = 3  # [rad/s] filtered: speed by the positions less the speed reported
+ODD = 4  # ticks for which the residual has been beyond its bound
 
 
-def fresh(n: int) -> Watch:
-    """Return the watch that has noticed nothing."""
-    zero = np.zeros(n)
-    return Watch(zero, zero, zero, zero, np.zeros(n, np.int64))
+def fresh(n: int) -> F64:
+    """Return the watch (5, n) that has noticed nothing."""
+    return np.zeros((5, n))
 
 
 @njit(cache=True, fastmath=False)
-def _watched(
-    equal: F64, speed: F64, travel: F64, residual: F64, odd: I64, q: F64, qd: F64, age: F64, replies: I64,
-    q_previous: F64, age_previous: F64, qdd: F64, A: F64, friction: F64, bound: F64, elapsed: float, dt: float,
-) -> tuple[F64, F64, F64, F64, I64, bool, bool]:  # fmt: skip
-    equal, speed, travel, residual, odd = equal.copy(), speed.copy(), travel.copy(), residual.copy(), odd.copy()
+def watched(
+    before: F64, q: F64, qd: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qdd: F64, A: F64,
+    friction: F64, bound: F64, elapsed: float, dt: float,
+) -> tuple[F64, bool, bool]:  # fmt: skip
+    """Return the watch after a tick, whether an encoder is stuck, and whether position and speed of one disagree.
+
+    q [rad], qd [rad/s], age [s], replies (n,) of the feedback, q_previous [rad] and age_previous [s] of the one before,
+    `elapsed` [s] ago; qdd (n,) [rad/s2] that the model predicts of the torque sent, A (n, n) its inertia; friction (n,)
+    [Nm] that may hold a joint; bound (n,) [rad/s] of the residual; dt [s] servo period.
+    """
+    w = before.copy()
     stuck, disagree, stirred = False, False, False
     for i in range(q.shape[0]):
         stirred = stirred or (replies[i] > 0 and q[i] != q_previous[i] and abs(qd[i]) > STIRRED)
@@ -50,29 +51,15 @@ def _watched(
             continue  # silence is a fault of its own
         moved = q[i] - q_previous[i]
         if moved != 0.0:
-            equal[i], travel[i], speed[i] = 0.0, 0.0, qd[i]
+            w[EQUAL, i], w[TRAVEL, i], w[SPEED, i] = 0.0, 0.0, qd[i]
         else:
-            equal[i] += elapsed
+            w[EQUAL, i] += elapsed
             free = stirred and abs(A[i, i] * qdd[i]) > friction[i]
-            speed[i] = speed[i] + qdd[i] * elapsed if free else qd[i]
-            travel[i] += elapsed * (speed[i] - travel[i] / MEMORY)
-            stuck = stuck or (equal[i] >= STUCK_TIME and abs(travel[i]) > STUCK_TRAVEL)
+            w[SPEED, i] = w[SPEED, i] + qdd[i] * elapsed if free else qd[i]
+            w[TRAVEL, i] += elapsed * (w[SPEED, i] - w[TRAVEL, i] / MEMORY)
+            stuck = stuck or (w[EQUAL, i] >= STUCK_TIME and abs(w[TRAVEL, i]) > STUCK_TRAVEL)
         apart = max(elapsed + age_previous[i] - age[i], dt)
-        residual[i] += SHARE * (moved / apart - qd[i] - residual[i])
-        odd[i] = odd[i] + 1 if abs(residual[i]) > bound[i] else 0
-        disagree = disagree or odd[i] >= DISAGREE_TICKS
-    return equal, speed, travel, residual, odd, stuck, disagree
-
-
-def watched(
-    w: Watch, q: F64, qd: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qdd: F64, A: F64,
-    friction: F64, bound: F64, elapsed: float, dt: float,
-) -> tuple[Watch, bool, bool]:  # fmt: skip
-    """Return the watch after a tick, whether an encoder is stuck, and whether position and speed of one disagree.
-
-    q [rad], qd [rad/s], age [s], replies (n,) of the feedback, q_previous [rad] and age_previous [s] of the one before,
-    `elapsed` [s] ago; qdd (n,) [rad/s2] that the model predicts of the torque sent, A (n, n) its inertia; friction (n,)
-    [Nm] that may hold a joint; bound (n,) [rad/s] of the residual; dt [s] servo period.
-    """
-    out = _watched(*w, q, qd, age, replies, q_previous, age_previous, qdd, A, friction, bound, elapsed, dt)
-    return Watch(*out[:5]), out[5], out[6]
+        w[RESIDUAL, i] += SHARE * (moved / apart - qd[i] - w[RESIDUAL, i])
+        w[ODD, i] = w[ODD, i] + 1 if abs(w[RESIDUAL, i]) > bound[i] else 0
+        disagree = disagree or w[ODD, i] >= DISAGREE_TICKS
+    return w, stuck, disagree

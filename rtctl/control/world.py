@@ -11,7 +11,7 @@ from rtctl.control.meshes import Meshes
 from rtctl.control.primitives import (
     CLOUDS,
     Obstacles,
-    advance,
+    advanced_pose,
     cloud_place,
     distances_into,
     fault_of,
@@ -122,18 +122,38 @@ def _without(world: World, slot: int) -> World:
     return _with_margins(_joined(world, slot, ""))
 
 
-def _with_margins(world: World, dt: float = 0.0) -> World:
-    due = world.creep * np.minimum(world.age, world.stale)
-    kept = world.obstacles.margin - EASE * world.creep * dt
-    return world._replace(obstacles=world.obstacles._replace(margin=np.maximum(due, kept) * world.moving))
+def _with_margins(world: World) -> World:
+    margin = _margins(world.obstacles.margin, world.age, world.moving, world.creep, world.stale, 0.0)
+    return world._replace(obstacles=world.obstacles._replace(margin=margin))
+
+
+@njit(cache=True, fastmath=False)
+def _margins(margin: F64, age: F64, moving: B1, creep: float, stale: float, dt: float) -> F64:
+    out = np.zeros_like(margin)
+    for k in range(margin.shape[0]):
+        if moving[k]:
+            out[k] = max(creep * min(age[k], stale), margin[k] - EASE * creep * dt)
+    return out
 
 
 def advanced(world: World, dt: float) -> World:
     """Return the table dt [s] later: poses extrapolated, observations older."""
     if not scan.any_set(world.moving):
         return world
-    world = world._replace(obstacles=advance(world.obstacles, dt), age=world.age + dt * world.moving)
-    return _with_margins(world, dt)
+    p, R, age, margin = _advanced(world.obstacles, world.age, world.moving, world.creep, world.stale, dt)
+    return world._replace(obstacles=world.obstacles._replace(p=p, R=R, margin=margin), age=age)
+
+
+@njit(cache=True, fastmath=False)
+def _advanced(
+    obstacles: Obstacles, age: F64, moving: B1, creep: float, stale: float, dt: float
+) -> tuple[F64, F64, F64, F64]:
+    p, R = advanced_pose(obstacles.active, obstacles.p, obstacles.R, obstacles.v, obstacles.w, dt)
+    older = age.copy()
+    for k in range(age.shape[0]):
+        if moving[k]:
+            older[k] += dt
+    return p, R, older, _margins(obstacles.margin, older, moving, creep, stale, dt)
 
 
 def distance_from(world: World, x: F64) -> F64:
@@ -141,7 +161,7 @@ def distance_from(world: World, x: F64) -> F64:
 
     To where it was seen to be and moves, without the margin of its age.
     """
-    return _distance_from(x, world.obstacles) + world.obstacles.margin
+    return _distance_from(x, world.obstacles)
 
 
 @njit(cache=True, fastmath=False)
@@ -149,7 +169,7 @@ def _distance_from(x: F64, obstacles: Obstacles) -> F64:
     slots = obstacles.active.shape[0]
     out = np.empty((slots, 4, 1))
     distances_into(x.copy().reshape(3, 1), np.zeros(1), obstacles, math.inf, out)
-    return out[:, 0, 0].copy()
+    return out[:, 0, 0] + obstacles.margin
 
 
 def oldest(world: World) -> float:
