@@ -46,15 +46,17 @@ def rows_of(raw: U8, at: I64, size: int) -> U8:
 
 def walk(data: Source, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
     """Yield (opcode, start of the body, end of the body) of the whole records between `at` and `stop`."""
-    while at + RECORD.size <= stop:
-        opcode, length = RECORD.unpack_from(data, at)
-        body = at + RECORD.size
-        if opcode == 0 or length > stop - body:
+    unpack, size, footer = RECORD.unpack_from, RECORD.size, int(Opcode.FOOTER)  # looked up once: there are thousands
+    body = at + size
+    while body <= stop:
+        opcode, length = unpack(data, body - size)
+        end = body + length
+        if opcode == 0 or end > stop:
             return
-        yield opcode, body, body + length
-        if opcode == Opcode.FOOTER:
+        yield opcode, body, end
+        if opcode == footer:
             return
-        at = body + length
+        body = end + size
 
 
 class ChunkHead(NamedTuple):
