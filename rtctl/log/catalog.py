@@ -116,11 +116,11 @@ def _from_summary(data: Source) -> Catalog | None:
         return None
     found = _empty(True, start)
     span = found.span
-    seen_statistics, indices = False, list[tuple[int, int]]()
+    seen_statistics, indices = False, list[int]()  # of chunks: start and end of the body in turn
     try:
         for opcode, body, end in walk(data, start, at):
             if opcode == _CHUNK_INDEX:  # nearly all of them
-                indices.append((body, end))
+                indices += (body, end)
             elif opcode == Opcode.STATISTICS:
                 statistics = parsed(records.Statistics.read, data, body, end)
                 span, seen_statistics = (statistics.message_start_time, statistics.message_end_time), True
@@ -140,8 +140,8 @@ def _from_summary(data: Source) -> Catalog | None:
     return found._replace(span=span, chunks=chunks)
 
 
-def _chunk_indices(data: Source, places: list[tuple[int, int]]) -> Chunks:
-    """Return the chunks that the index records at `places` name.
+def _chunk_indices(data: Source, places: list[int]) -> Chunks:
+    """Return the chunks that the index records named by `places`, (start, end) of each body in turn, point at.
 
     Some of the chunks' own records are looked at: a summary of another file is not believed. Looking at each would
     touch a page of the file for every chunk. Raises Damaged.
@@ -149,7 +149,7 @@ def _chunk_indices(data: Source, places: list[tuple[int, int]]) -> Chunks:
     if not places:
         return _chunks([], [], [])
     raw = np.frombuffer(data, np.uint8)
-    place = np.array(places, np.int64)
+    place = np.array(places, np.int64).reshape(-1, 2)
     space = place[:, 1] - place[:, 0] - _INDEX_HEAD.itemsize
     if (space < 0).any():
         raise Damaged("chunk index: too short")

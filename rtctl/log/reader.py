@@ -27,7 +27,7 @@ from rtctl.types import I64
 
 T = TypeVar("T")
 THREADS = min(4, os.cpu_count() or 1)  # zstd, checksums and numpy's copies let go of the interpreter's lock
-RUN = 8  # chunks that a thread takes at a time: handing over each would cost as much as unpacking it
+RUN = 16  # chunks that a thread takes at a time: handing over each would cost as much as unpacking it
 PIECE = 64  # chunks at a time of `pieces`
 
 
@@ -298,14 +298,13 @@ def _part(data: Source, offsets: I64, channel: int, start: int, stop: int) -> Pa
     if len(offsets) and (offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD.itemsize):
         offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
     head = rows_of(raw, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD).reshape(-1)
-    time = head["log"]
+    time, at = head["log"], offsets + MESSAGE_HEAD.itemsize
     good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start) & (time < min(stop, I64_MAX))
     body = head["length"] - np.uint64(MESSAGE.size)  # wraps for a length that is too small: then it is too large
-    good &= body <= np.uint64(size) - offsets.astype(np.uint64) - np.uint64(MESSAGE_HEAD.itemsize)
+    good &= body <= (size - at).view(np.uint64)
     if not good.all():
-        head, offsets, body = head[good], offsets[good], body[good]
-    at = offsets + MESSAGE_HEAD.itemsize
-    return Part(data, at, body.astype(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
+        head, at, body = head[good], at[good], body[good]
+    return Part(data, at, body.view(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
 
 
 def read(path: Path | str) -> Log:
