@@ -16,9 +16,9 @@ from rtctl.hal import clock
 from rtctl.hal.can import CanLink
 from rtctl.hal.recorder import Recorder
 from rtctl.log import read
-from rtctl.log.encode import Encoded
 from rtctl.log.info import info
 from rtctl.log.report import write_report
+from rtctl.log.rows import Encoded
 from rtctl.log.run import read_run
 from rtctl.log.schema import channels
 from rtctl.log.segment import begin
