@@ -1,14 +1,12 @@
 """The arm and its world as rigid bodies in pybullet: what the drives' torques do, and how near everything is.
 
-The URDF is rewritten for the plant: configured joints stay, all others are fixed at zero; visuals, URDF damping and
-friction are dropped; mechanical stops lie STOP outside the permitted range. Obstacles are massless and kinematic: they
+The URDF is rewritten for the plant, see `firmware_sim.urdf`. Obstacles are massless and kinematic: they
 push the arm, the arm does not push them. Links of the arm do not push each other; their distance is measured.
 
 Collision meshes of links are their convex hulls with pybullet's margin of 1 mm: clearances to them are 1 mm too small
 and contact begins 1 mm early. The same margin rounds the corners of a link's boxes, by 0.7 mm at most.
 """
 
-import math
 import os
 import tempfile
 import xml.etree.ElementTree as ET
@@ -20,13 +18,13 @@ from numpy.typing import NDArray
 
 from firmware_sim.bullet import pb, silent
 from firmware_sim.drive import NS
-from firmware_sim.settings import Settings, SettingsError, resolve
+from firmware_sim.settings import Settings, SettingsError
 from firmware_sim.shapes import collision_shape, shape_at, solid
+from firmware_sim.urdf import rewrite
 
 F64 = NDArray[np.float64]
 GRAVITY = 9.81  # [m/s^2]
 STEP_NS = 500_000  # longest physics step
-STOP = 0.1  # [rad or m] mechanical stop outside the permitted range
 SIGHT = 0.5  # [m] clearances are measured up to here; farther counts as this
 SELF_SIGHT = 0.1  # [m] the same between links of the arm
 BEYOND = SIGHT + 0.1  # [m] clouds are looked for up to here, so that far ones need not be measured every time
@@ -34,8 +32,6 @@ LEVER = 2.0  # [m] no point of the arm is further from the axis of any of its jo
 FASTEST = 10.0  # [m/s] no two links of an arm close faster
 NEAR, TOUCH = 0.1, 1e-3  # [m] see Plant._pairs
 MARGIN = 0.0
-WORLD = "plant_world"
-MASSLESS = '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
 
 
 class Contact(NamedTuple):
@@ -48,50 +44,6 @@ class Contact(NamedTuple):
     arm_m_s: float = 0.0  # speed with which the arm's own point came towards the obstacle, just before they met
     other_m_s: float = 0.0  # and the obstacle's towards the arm
     row: tuple[float, ...] = ()  # d gap/d q (n,) of the arm's point [m/rad]
-
-
-def rewrite(settings: Settings) -> str:
-    """Return the plant's URDF: absolute mesh paths, base pose built in, only the configured joints free."""
-    root = ET.parse(settings.urdf).getroot()
-    wanted = {j.name: j for j in settings.joints}
-    missing = wanted.keys() - {j.get("name") for j in root.iter("joint")}
-    if missing:
-        raise SettingsError(f"{settings.urdf}: has no joint {', '.join(sorted(missing))}")
-    for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-    for mesh in root.iter("mesh"):
-        mesh.set("filename", str(resolve(mesh.get("filename", ""), settings.urdf.parent, settings.package_dirs)))
-    for joint in root.findall("joint"):
-        for tag in ("dynamics", "mimic", "safety_controller"):
-            for element in joint.findall(tag):
-                joint.remove(element)
-        setting = wanted.get(joint.get("name", ""))
-        limit = joint.find("limit")
-        if setting is None:
-            joint.set("type", "fixed")
-        elif joint.get("type") in ("revolute", "prismatic") and limit is not None:
-            limit.set("lower", repr(min(float(limit.get("lower", "0")), setting.q_min) - STOP))
-            limit.set("upper", repr(max(float(limit.get("upper", "0")), setting.q_max) + STOP))
-    children = {c.get("link") for c in root.iter("child")}
-    base = next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
-    w, x, y, z = settings.base_wxyz
-    rpy = (
-        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
-        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-    )
-    root.append(ET.fromstring(f'<link name="{WORLD}"/>'))
-    for link in root.findall("link"):
-        if link.find("inertial") is None:  # pybullet would give it 1 kg
-            link.append(ET.fromstring(MASSLESS))
-    root.append(
-        ET.fromstring(
-            f'<joint name="{WORLD}_joint" type="fixed"><parent link="{WORLD}"/><child link="{base}"/>'
-            f'<origin xyz="{" ".join(map(repr, settings.base_position))}" rpy="{" ".join(map(repr, rpy))}"/></joint>'
-        )
-    )
-    return ET.tostring(root, encoding="unicode")
 
 
 class Plant:

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,22 +17,12 @@ from rtctl.errors import ConfigError
 from rtctl.hal.clock import lockstep
 from rtctl.hal.wire import InProcess
 from rtctl.servo import Servo
+from rtctl.tally import Leg, number, of_way
 from rtctl.types import F64, Goal, Request, State, Verb
 
 ARM_TIME = 5.0  # [s] within which the vehicle must be running
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 SHOWN = frozenset(("state", "fault", "vehicle"))  # events that are no statuses
-
-
-class Leg(NamedTuple):
-    """One goal on its way."""
-
-    goal: Goal
-    at: float  # [s]
-    start: F64  # (2,) [m]
-    reached: float = -1.0  # [s] since when the base has stayed within the tolerance, -1: not now
-    deviation: float = 0.0  # [m] from the straight line
-    error: float = np.inf  # [m]
 
 
 class Tally:
@@ -62,45 +52,13 @@ class Tally:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures under their published names."""
-        goals = [
-            {
-                "at_s": _r(leg.at),
-                "arrived": leg.reached >= 0.0,
-                "time_to_goal_s": _r(leg.reached - leg.at) if leg.reached >= 0.0 else None,
-                "error_m": _r(leg.error),
-                "line_deviation_m": _r(leg.deviation),
-            }
-            for leg in self.legs
-        ]
-        return {
-            "arrived": bool(self.legs) and all(leg.reached >= 0.0 for leg in self.legs),
-            "time_to_goal_s": goals[-1]["time_to_goal_s"] if goals else None,
-            "final_error_m": _r(self.legs[-1].error) if self.legs else None,
-            "path_length_m": _r(self.path),
-            "line_deviation_m": _r(max((leg.deviation for leg in self.legs), default=0.0)),
-            "max_speed_m_s": _r(self.speed),
-            "min_clearance_m": {
-                "all": _r(min(self.clearance.values())) if self.clearance else None,
-                **{name: _r(d) for name, d in self.clearance.items()},
-            },
-            "contacts": self.contacts,
-            "goals": goals,
-        }
-
-
-def _r(value: float) -> float | None:
-    return float(f"{value:.9g}") if np.isfinite(value) else None
+        return of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=False)
 
 
 def _advanced(leg: Leg, at: F64, now: float) -> Leg:
-    e = float(np.hypot(*(leg.goal.position[:2] - at)))
     along = leg.goal.position[:2] - leg.start
-    length = float(np.hypot(*along))
-    offset = at - leg.start
-    if length > 1e-9:
-        offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
-    reached = (leg.reached if leg.reached >= 0.0 else now) if e <= leg.goal.tolerance else -1.0
-    return leg._replace(reached=reached, deviation=max(leg.deviation, float(np.hypot(*offset))), error=e)
+    e = float(np.hypot(*(leg.goal.position[:2] - at)))
+    return leg.advanced(now, e <= leg.goal.tolerance, along, at - leg.start, e)
 
 
 class Feed:
@@ -159,13 +117,13 @@ def simulate_base(
         link.close()
     figures = {
         **tally.figures(),
-        "statuses": [[_r(t), name, detail] for t, name, detail in servo.events if name not in SHOWN],
-        "vehicle": [[_r(t), detail] for t, name, detail in servo.events if name == "vehicle"],
+        "statuses": [[number(t), name, detail] for t, name, detail in servo.events if name not in SHOWN],
+        "vehicle": [[number(t), detail] for t, name, detail in servo.events if name == "vehicle"],
         "mode_final": servo.memory.state.name,
         "faults": list(faults.names(servo.faults_seen)),
         "ticks": ticks,
         "missed": servo.missed,
-        "realtime_factor": _r(ticks * base.dt / elapsed),
+        "realtime_factor": number(ticks * base.dt / elapsed),
         "digest": servo.digest.hexdigest(),
     }
     return figures | ({"track": tally.track} if track else {})

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from rtctl.hal.clock import lockstep
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn
 from rtctl.stream import Follower, Seen
+from rtctl.tally import Leg, number, of_way
 from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
@@ -36,24 +37,12 @@ ARM_TIME = 2.0  # [s] within which the robot must be running
 SHOWN = frozenset(("state", "fault"))  # events that are no statuses
 
 
-class _Leg(NamedTuple):
-    """One goal on its way: where the tip was when it was given."""
-
-    goal: Goal
-    at: float  # [s]
-    start: F64  # (3,) [m]
-    reached: float = -1.0  # [s] since when the tip has stayed within the tolerances, -1 = not now
-    deviation: float = 0.0  # [m] from the straight line
-    error: float = np.inf  # [m]
-    error_rot: float = np.inf  # [rad]
-
-
 class Tally:
     """Figures of a run, from the truth of each period."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.legs: list[_Leg] = []
+        self.legs: list[Leg] = []
         self.tip: F64 | None = None
         self.tau: F64 | None = None
         self.path = self.speed = 0.0
@@ -86,59 +75,23 @@ class Tally:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures under their published names."""
-        last = self.legs[-1] if self.legs else None
-        goals = [
-            {
-                "at_s": _r(leg.at),
-                "arrived": leg.reached >= 0.0,
-                "time_to_goal_s": _r(leg.reached - leg.at) if leg.reached >= 0.0 else None,
-                "error_m": _r(leg.error),
-                "error_rad": _r(leg.error_rot),
-                "line_deviation_m": _r(leg.deviation),
-            }
-            for leg in self.legs
-        ]
         return {
-            "arrived": bool(self.legs) and all(leg.reached >= 0.0 for leg in self.legs),
-            "time_to_goal_s": goals[-1]["time_to_goal_s"] if goals else None,
-            "final_error_m": _r(last.error) if last else None,
-            "final_error_rad": _r(last.error_rot) if last else None,
-            "path_length_m": _r(self.path),
-            "line_deviation_m": _r(max((leg.deviation for leg in self.legs), default=0.0)),
-            "max_speed_m_s": _r(self.speed),
-            "min_clearance_m": {
-                "all": _r(min(self.clearance.values())) if self.clearance else None,
-                **{name: _r(d) for name, d in self.clearance.items()},
-            },
-            "min_self_clearance_m": _r(self.own),
-            "contacts": self.contacts,
-            "min_joint_margin_rad": _r(self.margin),
-            "max_torque_ratio": _r(self.torque),
-            "max_torque_rate_ratio": _r(self.rate),
-            "max_joint_speed_ratio": _r(self.joint_speed),
-            "goals": goals,
+            **of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=True),
+            "min_self_clearance_m": number(self.own),
+            "min_joint_margin_rad": number(self.margin),
+            "max_torque_ratio": number(self.torque),
+            "max_torque_rate_ratio": number(self.rate),
+            "max_joint_speed_ratio": number(self.joint_speed),
         }
 
 
-def _r(value: float) -> float | None:
-    """Return a figure to nine digits; JSON has no infinity."""
-    return float(f"{value:.9g}") if np.isfinite(value) else None
-
-
-def _advanced(leg: _Leg, truth: Truth) -> _Leg:
-    """Return the leg after a period: distance to the goal, to the line, and since when it has been there."""
+def _advanced(leg: Leg, truth: Truth) -> Leg:
     goal = leg.goal
     e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
     along = task.point_of(goal, leg.start) - leg.start
-    length = float(np.linalg.norm(along))
     offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
-    if length > 1e-9:
-        offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
     there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
-    reached = (leg.reached if leg.reached >= 0.0 else truth.time) if there else -1.0
-    return leg._replace(
-        reached=reached, deviation=max(leg.deviation, float(np.linalg.norm(offset))), error=e, error_rot=e_rot
-    )
+    return leg.advanced(truth.time, there, along, offset, e, e_rot)
 
 
 class Feed:
@@ -160,7 +113,7 @@ class Feed:
         m = servo.memory
         self.world = m.world
         if self.waiting is not None and not m.verdict:
-            self.tally.legs.append(_Leg(*self.waiting))
+            self.tally.legs.append(Leg(*self.waiting))
         self.waiting = None
         verb = Verb.NONE
         if m.state == State.IDLE and m.tick < 0:
@@ -283,7 +236,7 @@ def simulate(
         "faults": list(faults.names(servo.faults_seen)),
         "ticks": ticks,
         "missed": servo.missed,
-        "realtime_factor": _r(ticks * robot.dt / elapsed),
+        "realtime_factor": number(ticks * robot.dt / elapsed),
         "digest": servo.digest.hexdigest(),
     }
 
@@ -291,7 +244,7 @@ def simulate(
 def _statuses(servo: Servo, feed: Feed) -> list[list[Any]]:
     """Return what the controller and the planner said, [t, name, detail]."""
     said = [(t + feed.tally.offset, name, detail) for t, name, detail in servo.events if name not in SHOWN]
-    return [[_r(t), name, detail] for t, name, detail in sorted(said + feed.events, key=lambda event: event[0])]
+    return [[number(t), name, detail] for t, name, detail in sorted(said + feed.events, key=lambda event: event[0])]
 
 
 def _play(

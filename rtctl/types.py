@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
+U64 = NDArray[np.uint64]
 U8 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
 

@@ -268,6 +268,59 @@ def test_a_window_holds_what_the_whole_holds_between_its_ends(path: Path) -> Non
     assert part.q.tobytes() == log["/tick"].q[50:60].tobytes()
 
 
+def of_two_topics(path: Path) -> dict[str, list[int]]:
+    """Write chunks of which some hold one topic, some the other, some both; return the times of each."""
+    rng = np.random.default_rng(5)
+    times: dict[str, list[int]] = {"/a": [], "/b": []}
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=200)
+        writer.start()
+        channels = {name: writer.register_channel(name, "json", 0) for name in times}
+        for k in range(400):
+            name = ("/a", "/b", "/a" if rng.random() < 0.5 else "/b")[k // 20 % 3]
+            times[name].append(1000 + 10 * k)
+            writer.add_message(channels[name], 1000 + 10 * k, b'{"k": %d}' % k, k)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return times
+
+
+def test_any_window_of_many_chunks_holds_exactly_its_messages(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    times = of_two_topics(path)
+    log = read(path)
+    for start, stop in [
+        (0, 1000),
+        (0, 1001),
+        (4990, 1 << 70),
+        (-5, 1 << 63),
+        *np.random.default_rng(6).integers(900, 5100, (60, 2)).tolist(),
+    ]:
+        for name, every in times.items():
+            assert log.window(name, start, stop).time.tolist() == [t for t in every if start <= t < stop]
+    assert [t for part in log.pieces("/b") for t in part.time.tolist()] == times["/b"]
+
+
+def test_a_summary_that_points_elsewhere_costs_no_message(tmp_path: Path) -> None:
+    path, broken = tmp_path / "two.mcap", tmp_path / "broken.mcap"
+    times = of_two_topics(path)
+    raw = path.read_bytes()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[-2]
+    place = struct.pack("<QQ", index.chunk_start_offset, index.chunk_length)
+    number, at = next(iter(index.message_index_offsets.items()))
+    wrong = [(place, struct.pack("<QQ", x, index.chunk_length)) for x in (len(raw), 1 << 62, 1 << 63, (1 << 64) - 1)]
+    wrong += [(place, struct.pack("<QQ", index.chunk_start_offset, n)) for n in (len(raw), (1 << 64) - 1)]
+    wrong += [(struct.pack("<HQ", number, at), struct.pack("<HQ", number, x)) for x in (0, len(raw), (1 << 64) - 1)]
+    for old, new in wrong:
+        assert raw.count(old) == 1
+        broken.write_bytes(raw.replace(old, new))
+        log = read(broken)
+        assert {name: log[name].time.tolist() for name in times} == times
+        assert log.damaged == 0
+
+
 def test_entries_of_a_wrong_size_or_kind_are_counted_and_the_rest_is_written(tmp_path: Path) -> None:
     sink = McapSink(tmp_path / "a.mcap", header())
     for kind, payload in (

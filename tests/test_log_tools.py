@@ -415,7 +415,7 @@ def test_mavlink_is_listed_and_written_as_tlog(tmp_path: Path):
 def test_doctor_finds_nothing_in_a_good_log_and_names_what_is_wrong_with_a_bad_one(log: Path, tmp_path: Path):
     assert call("doctor", str(log))[0] == 0
     raw = bytearray(log.read_bytes())
-    raw[read(log)._catalog.chunks[2].body + 500] ^= 1
+    raw[int(read(log)._catalog.chunks.body[2]) + 500] ^= 1
     (tmp_path / "flipped.mcap").write_bytes(raw)
     code, out, _ = call("doctor", str(tmp_path / "flipped.mcap"))
     assert code == 1

@@ -14,8 +14,9 @@ from scipy.special import ellipk
 
 from firmware_sim import shapes
 from firmware_sim.bullet import pb
-from firmware_sim.plant import STOP, Plant
+from firmware_sim.plant import Plant
 from firmware_sim.settings import Settings, SettingsError, load
+from firmware_sim.urdf import STOP
 
 F64 = NDArray[np.float64]
 PANDA = Path(__file__).resolve().parent.parent / "configs" / "panda.toml"

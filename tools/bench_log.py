@@ -16,13 +16,13 @@ from rtctl.hal import clock
 from rtctl.hal.can import CanLink
 from rtctl.hal.recorder import Recorder
 from rtctl.log import read
-from rtctl.log.encode import Encoded
 from rtctl.log.info import info
 from rtctl.log.report import write_report
+from rtctl.log.rows import Encoded
 from rtctl.log.run import read_run
 from rtctl.log.schema import channels
 from rtctl.log.segment import begin
-from rtctl.log.walk import chunk_data, chunk_head, chunk_messages
+from rtctl.log.walk import chunk_messages
 from rtctl.replay import rebuilt, replay
 from rtctl.servo import Servo
 from rtctl.types import Command, Drive
@@ -117,11 +117,10 @@ def stretched(source: Path, target: Path, copies: int) -> float:
     """Write a log repeated, each copy later than the one before; return how long it lasts [s]."""
     log = read(source)
     header, span = log.header, log.span[1] - log.span[0] + 1_000_000
-    catalog = log._catalog
     segment = begin(target, header, channels(header), log.span[0], {"segment": "0", "session": target.stem})
     parts = []
-    for chunk in catalog.chunks:
-        raw = np.frombuffer(chunk_data(log._data, chunk_head(log._data, chunk.body, chunk.end)), np.uint8)
+    for k in range(len(log._catalog.chunks.body)):
+        raw = np.frombuffer(log._chunk(k) or b"", np.uint8)
         parts.append((raw, chunk_messages(raw.tobytes())))
     for k in range(copies):
         for raw, rows in parts:

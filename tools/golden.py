@@ -23,7 +23,7 @@ import zstandard
 
 from rtctl.errors import LogError, RtctlError
 from rtctl.log import schema
-from rtctl.log.encode import Encoded, message
+from rtctl.log.rows import Encoded, message
 from rtctl.log.run import Run, read_run
 from rtctl.log.segment import begin
 from rtctl.replay import Replay, replay

@@ -15,7 +15,6 @@ import argparse
 import functools
 import os
 import re
-import selectors
 import shlex
 import shutil
 import signal
@@ -24,13 +23,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Literal, NamedTuple
 
 import rtctl  # noqa: F401  its import names the kernel cache after the sources, for what runs beside vcan0 too
+from tools.child import Sink, exit_status, guarded, pipe, pump, writer
 
 ROOT = Path(__file__).resolve().parent.parent
 CHANNEL = "vcan0"
@@ -39,8 +39,6 @@ INSTALL = "apt-get update && apt-get install -y user-mode-linux kmod iproute2 ca
 KERNEL, MODULES = "linux.uml", Path("/usr/lib/uml/modules")
 TIMED_OUT, UNAVAILABLE = 124, 125  # as timeout(1) and container runners report them
 SBIN = "/usr/local/sbin:/usr/sbin:/sbin"
-
-Sink = Callable[[bytes], object]
 
 
 class VcanError(Exception):
@@ -95,7 +93,7 @@ def run(
     here = Path.cwd() if cwd is None else cwd.resolve()
     inside = dict(os.environ if env is None else env) | {MARK: CHANNEL}
     inside["PATH"] = f"{inside.get('PATH', os.defpath)}:{SBIN}"
-    sinks = (out or _writer(1), err or _writer(2))
+    sinks = (out or writer(1), err or writer(2))
     with tempfile.TemporaryDirectory(prefix="rtctl-vcan-", dir="/tmp") as name:
         scratch = Path(name)
         if venue.kind == "guest":
@@ -125,7 +123,7 @@ def _beside(
 ) -> int:
     """The command as a child of this process, its streams pumped into the sinks."""
     with ExitStack() as stack:
-        ends = [_pipe(stack) for _ in sinks]
+        ends = [pipe(stack) for _ in sinks]
         child = subprocess.Popen(
             command,
             cwd=cwd,
@@ -135,11 +133,11 @@ def _beside(
             stderr=ends[1][1],
             start_new_session=True,
         )
-        stack.enter_context(_guarded(child, scratch))
+        stack.enter_context(guarded(child, scratch))
         for _, write_end in ends:
             os.close(write_end)
-        ended = _pump({ends[0][0]: sinks[0], ends[1][0]: sinks[1]}, time.monotonic() + timeout, child)
-        return _status(child.wait()) if ended else TIMED_OUT
+        ended = pump({ends[0][0]: sinks[0], ends[1][0]: sinks[1]}, time.monotonic() + timeout, child)
+        return exit_status(child.wait()) if ended else TIMED_OUT
 
 
 def _in_guest(
@@ -158,7 +156,7 @@ def _in_guest(
     init.chmod(0o700)
     console, status = bytearray(), bytearray()
     with ExitStack() as stack:
-        ends = [_pipe(stack) for _ in range(4)]  # console, stdout, stderr, status
+        ends = [pipe(stack) for _ in range(4)]  # console, stdout, stderr, status
         kernel = _which(KERNEL) or KERNEL
         arguments = ["root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"mem={memory}", f"init={init}"]
         arguments += [f"uml_dir={scratch}/", "umid=guest", *QUICK, "con=null", f"con0=null,fd:{ends[0][1]}"]
@@ -173,11 +171,11 @@ def _in_guest(
             pass_fds=[write_end for _, write_end in ends],
             start_new_session=True,
         )
-        stack.enter_context(_guarded(guest, scratch))
+        stack.enter_context(guarded(guest, scratch))
         for _, write_end in ends:
             os.close(write_end)
         pumps = dict(zip((read_end for read_end, _ in ends), (console.extend, *sinks, status.extend), strict=True))
-        ended = _pump(pumps, time.monotonic() + timeout, guest, done=lambda: status.endswith(b"\n"))
+        ended = pump(pumps, time.monotonic() + timeout, guest, done=lambda: status.endswith(b"\n"))
     if not ended:
         return TIMED_OUT
     if not re.fullmatch(rb"\d+\s*", bytes(status)):
@@ -275,80 +273,6 @@ def _memory_directory(memory: str, scratch: Path) -> str:
         if shm.f_bavail * shm.f_frsize > need and not shm.f_flag & os.ST_NOEXEC:
             return "/dev/shm"
     return str(scratch)
-
-
-def _pump(
-    sinks: Mapping[int, Sink],
-    deadline: float,
-    child: "subprocess.Popen[bytes]",
-    done: Callable[[], bool] = lambda: False,
-) -> bool:
-    """Moves bytes to the sinks until all descriptors close, the child is gone or `done`; False at the deadline."""
-    with selectors.DefaultSelector() as selector:
-        for descriptor, sink in sinks.items():
-            os.set_blocking(descriptor, False)
-            selector.register(descriptor, selectors.EVENT_READ, sink)
-        while selector.get_map() and not done():
-            if time.monotonic() > deadline:
-                return False
-            gone = child.poll() is not None
-            ready = selector.select(0.0 if gone else 0.2)
-            for key, _ in ready:
-                if data := os.read(key.fd, 65536):
-                    key.data(data)
-                else:
-                    selector.unregister(key.fd)
-            if gone and not ready:
-                break
-    while time.monotonic() < deadline:
-        if done() or child.poll() is not None:
-            return True
-        time.sleep(0.01)
-    return False
-
-
-@contextmanager
-def _guarded(child: "subprocess.Popen[bytes]", scratch: Path) -> Iterator[None]:
-    """The child's whole session is killed on leaving, and by a guardian when this process itself is killed."""
-    read_end, write_end = os.pipe()
-    script = 'read -r _; kill -KILL "-$1"; rm -rf -- "$2"'
-    guardian = subprocess.Popen(
-        ["sh", "-c", script, "sh", str(child.pid), str(scratch)],
-        stdin=read_end,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        cwd="/",
-        start_new_session=True,
-    )
-    os.close(read_end)
-    try:
-        yield
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
-        guardian.kill()  # before its pipe closes: the process group's number may soon be somebody else's
-        guardian.wait()
-        os.close(write_end)
-
-
-def _status(returncode: int) -> int:
-    """Exit status as a shell reports it."""
-    return returncode if returncode >= 0 else 128 - returncode
-
-
-def _pipe(stack: ExitStack) -> tuple[int, int]:
-    read_end, write_end = os.pipe()
-    stack.callback(os.close, read_end)
-    return read_end, write_end
-
-
-def _writer(descriptor: int) -> Sink:
-    def write(data: bytes) -> None:
-        while data:
-            data = data[os.write(descriptor, data) :]
-
-    return write
 
 
 def _which(tool: str) -> str | None:

@@ -6,16 +6,16 @@ from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, axis_view
-from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import BLUE, FAINT, FRONT, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
-from rtctl.types import Status
+from rtctl.experiment.scene import Say, Trace, unsaid
+from rtctl.experiment.style import BLUE, FRONT, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
+from rtctl.experiment.tour import arrivals, leg, numbers, tour
 
 TITLE = "A planar arm of four joints in an enclosure"
 CAPTION = "whole-arm avoidance among walls and pillars, as stroboscopic frames, and the clearance of every moment"
 SEEN = axis_view(0, 1)
 LEFT, RIGHT, BELOW, ABOVE = -0.62, 1.62, -0.72, 1.16  # [m] the walls
 GOALS = ((0.22, 0.84), (0.13, 0.67), (1.1, 0.86))  # [m] in the plane
-FIRST, EVERY = 0.5, 3.4  # [s]
+EVERY = 3.4  # [s] a goal
 FRAMES = 7
 
 
@@ -47,30 +47,12 @@ class Data(NamedTuple):
 
 def run(say: Say = unsaid, goals: tuple[tuple[float, float], ...] = GOALS) -> Data:
     """Play the goals one after the other."""
-    scenario = {
-        "duration_s": FIRST + EVERY * len(goals),
-        "goal": [{"at_s": FIRST + EVERY * k, "position_m": [*g, 0.0]} for k, g in enumerate(goals)],
-        "obstacle": list(OBSTACLES),
-    }
-    return Data(played(scenario, config_file("planar4"), say), goals)
+    return Data(tour("planar4", [(*g, 0.0) for g in goals], EVERY, OBSTACLES, say), goals)
 
 
 def figures(data: Data) -> dict[str, Any]:
     """Return the numbers of the figure."""
-    f = data.trace.figures
-    return {
-        "arrived": [g["arrived"] for g in f["goals"]],
-        "error_m": [g["error_m"] for g in f["goals"]],
-        "time_to_goal_s": [g["time_to_goal_s"] for g in f["goals"]],
-        "line_deviation_m": [g["line_deviation_m"] for g in f["goals"]],
-        "min_clearance_m": f["min_clearance_m"],
-        "min_self_clearance_m": f["min_self_clearance_m"],
-        "contacts": f["contacts"],
-        "max_speed_m_s": f["max_speed_m_s"],
-        "max_torque_ratio": f["max_torque_ratio"],
-        "min_joint_margin_rad": f["min_joint_margin_rad"],
-        "faults": f["faults"],
-    }
+    return numbers(data.trace)
 
 
 def draw(data: Data) -> Figure:
@@ -94,7 +76,7 @@ def draw(data: Data) -> Figure:
 
 def _drawing(axes: Axes, data: Data, figurine: Figurine, k: int) -> None:
     trace = data.trace
-    rows = trace.rows(FIRST + EVERY * k, FIRST + EVERY * (k + 1) - 2e-3)
+    rows = leg(trace, k, k)
     draw_shapes(axes, trace.shapes(0.0), SEEN)
     picked = rows.start + strobes(trace.q[rows], FRAMES)
     draw_strobes(axes, figurine, trace, picked, SEEN)
@@ -114,13 +96,9 @@ def _clearance(axes: Axes, data: Data) -> None:
     avoid = trace.robot.avoid
     level(axes, 1e3 * avoid.rho_min, "clearance", RED)
     level(axes, 1e3 * avoid.rho0, "influence", BLUE)
-    for k in range(len(data.goals)):
-        at = FIRST + EVERY * k
-        axes.axvline(at, color=FAINT, lw=1.0)
-        arrived = trace.time[(trace.status == int(Status.ARRIVED)) & (trace.time > at)]
-        if len(arrived) and arrived[0] < at + EVERY:
-            axes.plot(arrived[0], 6.0, "*", ms=13, mfc=ORANGE, mec=INK, mew=0.9, zorder=12, clip_on=False)
-        axes.text(at + 0.06, 134, f"goal {k + 1}", fontsize=12, color=INK, va="top")
+    arrivals(axes, trace, 6.0)
+    for k, goal in enumerate(trace.scenario.goal):
+        axes.text(goal.at_s + 0.06, 134, f"goal {k + 1}", fontsize=12, color=INK, va="top")
     axes.set_ylim(0.0, 140.0)
     axes.set_xlim(0.0, trace.time[-1])
     axes.set_xlabel("time [s]")

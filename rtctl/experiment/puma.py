@@ -7,15 +7,15 @@ from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, View, axis_view, view
-from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
+from rtctl.experiment.scene import Say, Trace, unsaid
 from rtctl.experiment.style import BLUE, FAINT, FRONT, GREEN, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
-from rtctl.types import Status
+from rtctl.experiment.tour import arrivals, leg, numbers, tour
 
 TITLE = "A PUMA 560 reaches around obstacles"
 CAPTION = "the paper's robot among a post, a ball and a crate: from the side, from above, and its clearances"
 START = (0.9, 0.6, -2.6, 0.0, 0.8, 0.0)  # [rad]
 GOALS = ((0.60, -0.50, 0.72), (0.24, -0.75, 0.95))  # [m]
-FIRST, EVERY = 0.5, 4.0  # [s]
+EVERY = 4.0  # [s] a goal
 FRAMES = 6
 OBLIQUE = view(np.radians(-14.0), np.radians(26.0))
 ABOVE = axis_view(0, 1)
@@ -37,32 +37,12 @@ class Data(NamedTuple):
 
 def run(say: Say = unsaid, goals: tuple[tuple[float, float, float], ...] = GOALS) -> Data:
     """Play the goals one after the other."""
-    scenario = {
-        "duration_s": FIRST + EVERY * len(goals),
-        "start_q_rad": list(START),
-        "goal": [{"at_s": FIRST + EVERY * k, "position_m": list(g)} for k, g in enumerate(goals)],
-        "obstacle": list(OBSTACLES),
-    }
-    return Data(played(scenario, config_file("puma560"), say), goals)
+    return Data(tour("puma560", goals, EVERY, OBSTACLES, say, START), goals)
 
 
 def figures(data: Data) -> dict[str, Any]:
     """Return the numbers of the figure."""
-    f = data.trace.figures
-    return {
-        "arrived": [g["arrived"] for g in f["goals"]],
-        "error_m": [g["error_m"] for g in f["goals"]],
-        "time_to_goal_s": [g["time_to_goal_s"] for g in f["goals"]],
-        "line_deviation_m": [g["line_deviation_m"] for g in f["goals"]],
-        "min_clearance_m": f["min_clearance_m"],
-        "min_self_clearance_m": f["min_self_clearance_m"],
-        "contacts": f["contacts"],
-        "max_speed_m_s": f["max_speed_m_s"],
-        "max_torque_ratio": f["max_torque_ratio"],
-        "max_joint_speed_ratio": f["max_joint_speed_ratio"],
-        "min_joint_margin_rad": f["min_joint_margin_rad"],
-        "faults": f["faults"],
-    }
+    return numbers(data.trace)
 
 
 def draw(data: Data) -> Figure:
@@ -92,7 +72,7 @@ def draw(data: Data) -> Figure:
 def _drawing(axes: Axes, data: Data, figurine: Figurine, seen: View, first: int, last: int) -> None:
     """Draw legs in one view: obstacles behind the arm, frames from light to dark, the way of the tip."""
     trace = data.trace
-    rows = trace.rows(FIRST + EVERY * first, FIRST + EVERY * (last + 1) - 2e-3)
+    rows = leg(trace, first, last)
     solids = [s for s in trace.shapes(0.0) if s.type != "plane"]
     draw_shapes(axes, sorted(solids, key=lambda s: float(s.position @ seen.toward)), seen)
     picked = rows.start + strobes(trace.q[rows], FRAMES)
@@ -109,12 +89,7 @@ def _clearance(axes: Axes, data: Data) -> None:
         if name != "floor":
             axes.plot(*thinned(trace.time, 1e3 * d), color=colour, lw=1.9, label=name)
     level(axes, 1e3 * trace.robot.avoid.rho_min, "clearance", RED)
-    for k in range(len(data.goals)):
-        at = FIRST + EVERY * k
-        axes.axvline(at, color=FAINT, lw=1.0, zorder=1)
-        arrived = trace.time[(trace.status == int(Status.ARRIVED)) & (trace.time > at)]
-        if len(arrived) and arrived[0] < at + EVERY:
-            axes.plot(arrived[0], 8.0, "*", ms=12, mfc=ORANGE, mec=INK, mew=0.9, zorder=12, clip_on=False)
+    arrivals(axes, trace, 8.0)
     axes.set_ylim(0.0, 300.0)
     axes.set_xlim(0.0, trace.time[-1])
     axes.set_xlabel("time [s]")

@@ -2,8 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -11,11 +10,11 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from rtctl.log import schema
 from rtctl.log.entry import Batch, Kind, Payload
 from rtctl.log.header import Header
+from rtctl.log.rows import Encoded, Rows, assembled, copies, message, rows_for, stamped
 from rtctl.log.scene import HZ, Scene
-from rtctl.log.schema import MESSAGE, Layout
+from rtctl.log.schema import MESSAGE
 from rtctl.types import I64, U8
 
-OP_MESSAGE = 5
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
 LEVELS = {"rejected": WARNING, "fault": ERROR}  # by the event's name
 EVIDENCE = 50  # ticks that are kept with a fault
@@ -28,48 +27,6 @@ CAN_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved"
 CANFD_FRAME = np.dtype([("id", "<u4"), ("len", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("data", "u1", (64,))])
 EFF, RTR, ERR = 0x80000000, 0x40000000, 0x20000000  # flag bits of the kernel's can_id
 BRS, ESI = 0x01, 0x02  # of canfd_frame.flags
-
-
-class Encoded(NamedTuple):
-    """Whole message records and where they are; columns of equal length, in the order of `data`."""
-
-    data: bytes
-    channel: I64
-    sequence: I64
-    time: I64  # log_time [ns]
-    offset: I64  # in data
-
-
-class _Rows(NamedTuple):
-    """Template of a constant-size piece of one or two message records, and its parts."""
-
-    template: U8
-    dtype: np.dtype[np.void]
-
-
-def _rows(parts: Sequence[tuple[int, Layout]]) -> _Rows:
-    """Return the rows that hold one message of each (channel, layout), one behind the other."""
-    fields: list[tuple[str, Any]] = []
-    for number, (_, layout) in enumerate(parts):
-        fields += [(f"head{number}", MESSAGE), (f"body{number}", layout.wire)]
-    dtype = np.dtype(fields)
-    template = np.zeros(dtype.itemsize, np.uint8)
-    row = template.view(dtype)
-    for number, (channel, layout) in enumerate(parts):
-        head = row[f"head{number}"]
-        head["op"], head["channel"] = OP_MESSAGE, channel
-        head["length"] = MESSAGE.itemsize - 9 + layout.wire.itemsize
-        start = dtype.fields[f"body{number}"][1]  # type: ignore[index]
-        template[start : start + layout.wire.itemsize] = layout.template
-    return _Rows(template, dtype)
-
-
-def message(channel: int, sequence: int, time: int, data: bytes) -> bytes:
-    """Return one message record."""
-    head = np.zeros(1, MESSAGE)
-    head["op"], head["length"], head["channel"] = OP_MESSAGE, MESSAGE.itemsize - 9 + len(data), channel
-    head["sequence"], head["log"], head["publish"] = sequence & 0xFFFFFFFF, time, time
-    return head.tobytes() + data
 
 
 class Encoder:
@@ -90,11 +47,11 @@ class Encoder:
         self._can_id = [self._id[schema.can_topic(bus)] for bus in header.buses]
         self._own: dict[int, int] = {}  # sequence numbers of the channels that the recorder itself writes
         joints = schema.joint_state_layout(header.joints)
-        self._tick = _rows(
+        self._tick = rows_for(
             [(self._id[schema.TICK], schema.tick_layout(header.dtype)), (self._id[schema.JOINT_STATES], joints)]
         )
         self._has_state = {"q", "qd", "tau_measured"} <= set(header.dtype.names or ())
-        self._can: dict[tuple[int, int], _Rows] = {}
+        self._can: dict[tuple[int, int], Rows] = {}
         self._scene = Scene(header) if self._has_state else None
         self._due = 0  # [ns] monotonic, of the next scene
         self._recent: deque[bytes] = deque(maxlen=EVIDENCE)  # the last ticks
@@ -115,7 +72,7 @@ class Encoder:
             payloads = [batch.payload[i] for i in indices]
             columns += self._group(key, rows, payloads, time[rows], sequence[rows], pieces)
         dropouts = self._dropouts(batch)
-        return _assembled(dropouts, pieces, columns, views)
+        return assembled(dropouts, pieces, columns, views)
 
     def _watch(self, batch: Batch) -> list[Encoded]:
         """Go through a batch in its order: what viewers show, what operators asked, and the evidence of faults."""
@@ -229,14 +186,14 @@ class Encoder:
 
     def _ticks(self, payloads: list[Payload], stamp: I64, sequence: I64) -> U8:
         record = np.frombuffer(b"".join(payloads), self.header.dtype)
-        block = _copies(self._tick.template, len(payloads))
+        block = copies(self._tick.template, len(payloads))
         rows = block.reshape(-1).view(self._tick.dtype)
-        _stamp(rows["head0"], stamp, sequence)
+        stamped(rows["head0"], stamp, sequence)
         body = rows["body0"]
         for name in self.header.dtype.names or ():
             body[name] = record[name]
         if self._has_state:
-            _stamp(rows["head1"], stamp, sequence)
+            stamped(rows["head1"], stamp, sequence)
             state = rows["body1"]
             state["sec"], state["nanosec"] = stamp // 1_000_000_000, stamp % 1_000_000_000
             state["position"], state["velocity"] = record["q"], record["qd"]
@@ -248,12 +205,12 @@ class Encoder:
     ) -> U8:
         found = self._can.get((channel, size))
         if found is None:
-            found = self._can[channel, size] = _rows([(channel, schema.can_layout(size))])
+            found = self._can[channel, size] = rows_for([(channel, schema.can_layout(size))])
         fd = len(payloads[0]) == 72
         frame = np.frombuffer(b"".join(payloads), CANFD_FRAME if fd else CAN_FRAME)
-        block = _copies(found.template, len(payloads))
+        block = copies(found.template, len(payloads))
         rows = block.reshape(-1).view(found.dtype)
-        _stamp(rows["head0"], stamp, sequence)
+        stamped(rows["head0"], stamp, sequence)
         body = rows["body0"]
         extended = (frame["id"] & EFF) != 0
         body["stamp_ns"], body["dlc"] = time, size
@@ -331,16 +288,6 @@ class Encoder:
         return [self._dropout(count, since, time)]
 
 
-def _copies(template: U8, n: int) -> U8:
-    block = np.empty((n, len(template)), np.uint8)
-    block[:] = template
-    return block
-
-
-def _stamp(head: np.ndarray[Any, Any], stamp: I64, sequence: I64) -> None:
-    head["sequence"], head["log"], head["publish"] = sequence, stamp, stamp
-
-
 def event_of(payload: bytes) -> dict[str, Any]:
     """Return the JSON object of an event or request; {"message": text} for anything else."""
     try:
@@ -375,40 +322,3 @@ def _plain(values: np.ndarray[Any, Any]) -> Any:
     plain = values.astype(object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
-
-
-def _assembled(
-    first: list[Encoded], pieces: list[Payload], columns: list[tuple[I64, int, I64, I64, int]], last: list[Encoded]
-) -> Encoded:
-    """Return everything as one block, its columns in the order of the bytes."""
-    lead = b"".join(e.data for e in first)
-    sizes = np.fromiter(map(len, pieces), np.int64, len(pieces))
-    starts = np.cumsum(sizes) - sizes + len(lead)
-    channel, time, sequence, offset = ([] for _ in range(4))  # type: tuple[list[I64], list[I64], list[I64], list[I64]]
-    at = 0
-    behind = len(lead) + int(sizes.sum())
-    for k, e in enumerate([*first, *last]):
-        if k == len(first):
-            at = behind
-        channel.append(e.channel)
-        time.append(e.time)
-        sequence.append(e.sequence)
-        offset.append(e.offset + at)
-        at += len(e.data)
-    for rows, number, stamp, counted, within in columns:
-        channel.append(np.full(len(rows), number, dtype=np.int64))
-        time.append(stamp)
-        sequence.append(counted)
-        offset.append(starts[rows] + within)
-    if not channel:
-        none = np.zeros(0, dtype=np.int64)
-        return Encoded(b"", none, none, none, none)
-    offsets = np.concatenate(offset)
-    order = np.argsort(offsets, kind="stable")
-    return Encoded(
-        lead + b"".join(pieces) + b"".join(e.data for e in last),
-        np.concatenate(channel)[order],
-        np.concatenate(sequence)[order],
-        np.concatenate(time)[order],
-        offsets[order],
-    )

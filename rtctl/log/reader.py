@@ -15,7 +15,7 @@ from mcap import records
 
 from rtctl.errors import LogError
 from rtctl.log import schema
-from rtctl.log.catalog import Catalog, ChunkRef, attachment, catalog, describe_chunk
+from rtctl.log.catalog import Catalog, attachment, catalog, describe_chunk
 from rtctl.log.header import Header, header_from_json, of_attachment
 from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.log.segment import INFO, OPEN
@@ -27,6 +27,7 @@ from rtctl.types import I64
 
 T = TypeVar("T")
 THREADS = min(4, os.cpu_count() or 1)  # zstd, checksums and numpy's copies let go of the interpreter's lock
+RUN = 16  # chunks that a thread takes at a time: handing over each would cost as much as unpacking it
 PIECE = 64  # chunks at a time of `pieces`
 
 
@@ -48,10 +49,9 @@ class Log:
 
     def _describe_from_chunks(self) -> None:
         known = set(self._catalog.channels)
-        for chunk in self._catalog.chunks:
-            if not set(chunk.indices) <= known or not known:
-                records_of_chunk = self._chunk(chunk)
-                describe_chunk(self._catalog, records_of_chunk or b"")
+        for k, channels in enumerate(self._catalog.chunks.channels()):
+            if not known.issuperset(channels.tolist()) or not known:
+                describe_chunk(self._catalog, self._chunk(k) or b"")
                 known = set(self._catalog.channels)
 
     @property
@@ -156,7 +156,7 @@ class Log:
         Raises LogError when the file has no such topic.
         """
         if topic not in self._topics:
-            self._topics[topic] = self._topic(topic, self._catalog.chunks, True)
+            self._topics[topic] = self._topic(topic, slice(None), True)
         return self._topics[topic]
 
     @property
@@ -183,17 +183,16 @@ class Log:
 
         Raises LogError when the file has no such topic.
         """
-        return self._topic(topic, self._catalog.chunks, True, start, stop)
+        return self._topic(topic, slice(None), True, start, stop)
 
     def pieces(self, topic: str) -> Iterator[Topic]:
         """Yield a topic some chunks at a time, so that any length fits into memory. Raises LogError without it."""
-        chunks = self._catalog.chunks
-        for at in range(0, len(chunks), PIECE):
-            yield self._topic(topic, chunks[at : at + PIECE], False)
+        for at in range(0, len(self._catalog.chunks.body), PIECE):
+            yield self._topic(topic, slice(at, at + PIECE), False)
         if self._catalog.loose:
-            yield self._topic(topic, [], True)
+            yield self._topic(topic, slice(0), True)
 
-    def _topic(self, name: str, chunks: list[ChunkRef], loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
+    def _topic(self, name: str, among: slice, loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
         if not ids:
             raise LogError(f"{self.path}: no topic {name}; it has {', '.join(self.topics)}")
@@ -206,46 +205,51 @@ class Log:
                 dtype = self.header.dtype
 
         def source(work: Callable[[Part], T]) -> list[T]:
-            return [done for i in ids for done in self._map(work, i, chunks, loose, start, stop)]
+            return [done for i in ids for done in self._map(work, i, among, loose, start, stop)]
 
         return Topic(name, channel, schema_name, dtype, source)
 
     def _map(
-        self, work: Callable[[Part], T], channel: int, chunks: list[ChunkRef], loose: bool, start: int, stop: int
+        self, work: Callable[[Part], T], channel: int, among: slice, loose: bool, start: int, stop: int
     ) -> Iterator[T]:
         """Yield what `work` makes of a channel's messages, chunk by chunk; chunks are unpacked by several threads."""
+        chunks = self._catalog.chunks
+        indices = chunks.indices(channel)
+        chosen = (chunks.end_time >= start) & (chunks.start_time < stop) & (indices >= 0)
+        numbers = np.arange(len(chosen))[among]
+        wanted = numbers[chosen[among]].tolist()
 
-        def one(chunk: ChunkRef) -> T | None:
-            content = self._chunk(chunk)
-            return (
-                None
-                if content is None
-                else work(_part(content, self._offsets(chunk, channel, content), channel, start, stop))
+        def some(run: list[int]) -> list[T]:
+            contents = ((self._chunk(k), int(indices[k])) for k in run)
+            parts = (
+                _part(content, self._offsets(at, channel, content), channel, start, stop)
+                for content, at in contents
+                if content is not None
             )
+            return [work(part) for part in parts]
 
-        wanted = [
-            c for c in chunks if c.end_time >= start and c.start_time < stop and (not c.indices or channel in c.indices)
-        ]
-        if len(wanted) > 2:
+        runs = [wanted[at : at + RUN] for at in range(0, len(wanted), RUN)]
+        if len(runs) > 1:
             with ThreadPoolExecutor(THREADS) as pool:
-                found = list(pool.map(one, wanted))
+                found = list(pool.map(some, runs))
         else:
-            found = [one(chunk) for chunk in wanted]
-        yield from (done for done in found if done is not None)
+            found = [some(run) for run in runs]
+        for results in found:
+            yield from results
         if loose and self._catalog.loose:
             rows = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
             yield work(_part(self._data, rows, channel, start, stop))
 
-    def _chunk(self, chunk: ChunkRef) -> bytes | None:
+    def _chunk(self, number: int) -> bytes | None:
+        body, end = int(self._catalog.chunks.body[number]), int(self._catalog.chunks.end[number])
         try:
-            return chunk_data(self._data, chunk_head(self._data, chunk.body, chunk.end))
+            return chunk_data(self._data, chunk_head(self._data, body, end))
         except Damaged:
-            self._damaged.add(chunk.body)
+            self._damaged.add(body)
             return None
 
-    def _offsets(self, chunk: ChunkRef, channel: int, records_of_chunk: bytes) -> I64:
-        """Return where the channel's messages are in a chunk: by its index, else by walking."""
-        at = chunk.indices.get(channel, 0)
+    def _offsets(self, at: int, channel: int, records_of_chunk: bytes) -> I64:
+        """Return where the channel's messages are in a chunk, ascending: by its index at `at`, else by walking."""
         if at and at + RECORD.size <= len(self._data):
             try:
                 _, length = RECORD.unpack_from(self._data, at)
@@ -275,30 +279,32 @@ class Log:
                 low, high = min(low, int(part.time.min())), max(high, int(part.time.max()))
 
         loose = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
-        for chunk in self._catalog.chunks:
-            content = self._chunk(chunk)
+        indices = {i: self._catalog.chunks.indices(i).tolist() for i in self._catalog.channels}
+        for k in range(len(self._catalog.chunks.body)):
+            content = self._chunk(k)
             for i, channel in self._catalog.channels.items() if content is not None else ():
-                if not chunk.indices or i in chunk.indices:
-                    add(_part(content or b"", self._offsets(chunk, i, content or b""), i, 0, I64_MAX), channel.topic)
+                if indices[i][k] >= 0:
+                    at = self._offsets(indices[i][k], i, content or b"")
+                    add(_part(content or b"", at, i, 0, I64_MAX), channel.topic)
         for i, channel in self._catalog.channels.items() if len(loose) else ():
             add(_part(self._data, loose, i, 0, I64_MAX), channel.topic)
         return dict(sorted(counts.items())), (low, high) if counts else (0, 0)
 
 
 def _part(data: Source, offsets: I64, channel: int, start: int, stop: int) -> Part:
-    """Return the messages at `offsets` that are what is wanted."""
+    """Return the messages at `offsets`, which ascend, that are what is wanted."""
     raw = np.frombuffer(data, np.uint8)
     size = len(raw)
-    offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
+    if len(offsets) and (offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD.itemsize):
+        offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
     head = rows_of(raw, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD).reshape(-1)
-    time = head["log"]
+    time, at = head["log"], offsets + MESSAGE_HEAD.itemsize
     good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start) & (time < min(stop, I64_MAX))
     body = head["length"] - np.uint64(MESSAGE.size)  # wraps for a length that is too small: then it is too large
-    good &= body <= np.uint64(size) - offsets.astype(np.uint64) - np.uint64(MESSAGE_HEAD.itemsize)
+    good &= body <= (size - at).view(np.uint64)
     if not good.all():
-        head, offsets, body = head[good], offsets[good], body[good]
-    at = offsets + MESSAGE_HEAD.itemsize
-    return Part(data, at, body.astype(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
+        head, at, body = head[good], at[good], body[good]
+    return Part(data, at, body.view(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
 
 
 def read(path: Path | str) -> Log:

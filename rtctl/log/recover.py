@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.catalog import attachment, parsed
-from rtctl.log.encode import Encoded, message
+from rtctl.log.rows import Encoded, message
 from rtctl.log.segment import OPEN, Segment, settle
 from rtctl.log.summary import END, Summary, message_indices
 from rtctl.log.walk import (

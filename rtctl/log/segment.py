@@ -12,8 +12,8 @@ from isal import isal_zlib
 from mcap import records
 from mcap.opcode import Opcode
 
-from rtctl.log.encode import Encoded
 from rtctl.log.header import Header, header_to_json
+from rtctl.log.rows import Encoded
 from rtctl.log.schema import Channel
 from rtctl.log.summary import MAGIC, Summary, message_indices, packed
 

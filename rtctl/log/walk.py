@@ -2,6 +2,7 @@
 
 import mmap
 import struct
+import threading
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
@@ -20,6 +21,16 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time
 Source: TypeAlias = bytes | mmap.mmap
 I64_MAX = (1 << 63) - 1
 LARGEST = 1 << 30  # [bytes] of an uncompressed chunk that we are willing to hold
+
+
+class _Zstd(threading.local):
+    """A decompressor for each thread: making one takes a tenth of the time of a chunk."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_ZSTD = _Zstd()
 
 
 class Messages(NamedTuple):
@@ -46,15 +57,17 @@ def rows_of(raw: U8, at: I64, size: int) -> U8:
 
 def walk(data: Source, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
     """Yield (opcode, start of the body, end of the body) of the whole records between `at` and `stop`."""
-    while at + RECORD.size <= stop:
-        opcode, length = RECORD.unpack_from(data, at)
-        body = at + RECORD.size
-        if opcode == 0 or length > stop - body:
+    unpack, size, footer = RECORD.unpack_from, RECORD.size, int(Opcode.FOOTER)  # looked up once: there are thousands
+    body = at + size
+    while body <= stop:
+        opcode, length = unpack(data, body - size)
+        end = body + length
+        if opcode == 0 or end > stop:
             return
-        yield opcode, body, body + length
-        if opcode == Opcode.FOOTER:
+        yield opcode, body, end
+        if opcode == footer:
             return
-        at = body + length
+        body = end + size
 
 
 class ChunkHead(NamedTuple):
@@ -99,7 +112,7 @@ def chunk_data(data: Source, head: ChunkHead) -> bytes:
         if head.compression == "zstd":
             if zstandard.frame_content_size(raw) not in (head.size, -1):
                 raise Damaged("chunk: its size differs from what it says")
-            records = zstandard.ZstdDecompressor().decompress(raw, max_output_size=head.size or 1)
+            records = _ZSTD.decompressor.decompress(raw, max_output_size=head.size or 1)
         elif head.compression == "lz4":
             records = lz4.frame.LZ4FrameDecompressor().decompress(raw, max_length=head.size or 1)
         elif head.compression == "":
