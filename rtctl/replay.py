@@ -5,10 +5,12 @@ The command frames are made anew by the daemon's own encoder, so that what is co
 
 import gc
 import hashlib
-import json
+import multiprocessing
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -18,6 +20,7 @@ import numpy as np
 
 from rtctl import config as cfg
 from rtctl.assembly import link_spec
+from rtctl.compare import Check, Difference, Divergence, Wire
 from rtctl.config import Config
 from rtctl.config.urdf import urdf_file
 from rtctl.control.pipe import initial, tick
@@ -25,42 +28,17 @@ from rtctl.control.robot import Robot
 from rtctl.errors import ConfigError, LogError
 from rtctl.hal.can import CanLink
 from rtctl.log import schema
-from rtctl.log.fields import size_of, unit_of
+from rtctl.log.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
 from rtctl.log.header import meshes_of
 from rtctl.log.mesh import unpacked
-from rtctl.log.replay import Logged, feedbacks_of, inputs
+from rtctl.log.replay import EVERYTHING, Logged, feedbacks_of, inputs
 from rtctl.log.run import Run
-from rtctl.log.topic import CAN_ROW, Structured, stacked
-from rtctl.protocol import frame
+from rtctl.log.topic import Structured
+from rtctl.log.walk import I64_MAX
 from rtctl.servo import first_feedback
-from rtctl.types import F64, I64, Command, Drive, Request, Transport
+from rtctl.types import F64, Command, Drive, Request, Transport
 
 BLOCK = 1000  # ticks that are compared at once
-GIVEN = frozenset(("lateness", "compute"))  # copied through, never computed
-COUNTER_AT = 8  # of the counter in a protected frame's data
-
-
-class Divergence(NamedTuple):
-    """Where a replay first differs from the log."""
-
-    tick: int
-    time: float  # [s] robot time
-    joint: str  # or obstacle slot, or axis; '' for a field without parts
-    field: str  # of the record, or `frame`
-    logged: str
-    replayed: str
-    size: str  # of the difference, with unit
-
-
-class Difference(NamedTuple):
-    """How far one field differs over a whole replay."""
-
-    field: str
-    unit: str
-    ticks: int  # in which it differs
-    first: int  # tick
-    largest: float  # absolute difference; NaN where a number stands against none
-    at: int  # tick of the largest
 
 
 class Replay(NamedTuple):
@@ -146,6 +124,7 @@ class _Subject(NamedTuple):
     feedbacks: Callable[[Structured], Iterable[Any]]
     link: CanLink | None  # encodes commands again; None: the records alone are compared
     shown: str  # the field of a command that is drawn
+    robot: Robot | None = None  # of an arm: its memory is kept in checkpoints
 
 
 def _arm(run: Run, config: Path | None) -> _Subject:
@@ -153,7 +132,7 @@ def _arm(run: Run, config: Path | None) -> _Subject:
     link = CanLink(link_spec(what), cast(Transport, _Null()))
     memory = initial(robot, first_feedback(_first_q(run)))
     step = lambda m, feedback, request: tick(robot, m, feedback, request)  # noqa: E731
-    return _Subject(robot.name, robot.dt, memory, step, feedbacks_of, link, "tau_sent")
+    return _Subject(robot.name, robot.dt, memory, step, feedbacks_of, link, "tau_sent", robot)
 
 
 def _base(run: Run, config: Path | None) -> _Subject:
@@ -179,23 +158,133 @@ def _base(run: Run, config: Path | None) -> _Subject:
     return _Subject(base.name, base.dt, pipe.initial(base, start), step, rows, None, "v_world")
 
 
+class _Mark(NamedTuple):
+    """A checkpoint of the log: a replay can begin behind it, and what it ends with can be held against it."""
+
+    time: int  # [ns] log_time of its tick
+    text: bytes
+
+
+class _Part(NamedTuple):
+    """What the replay of a span found; fields as in Replay."""
+
+    ticks: int
+    frames: int
+    divergence: Divergence | None
+    differences: tuple[Difference, ...]
+    ignored: tuple[str, ...]
+    time: F64
+    logged: F64
+    replayed: F64
+    sent: bytes  # command frames, where they were asked for
+    agrees: bool  # with the checkpoint at its end
+
+
 def replay(run: Run, config: Path | None = None, progress: Callable[[int], None] = lambda n: None) -> Replay:
     """Return how the tick's replay differs from the log; with `config`, how that config's commands would.
 
+    Between the log's checkpoints a span does not depend on the one before, so that all processors replay at once; that
+    each span ends in the bits of the next checkpoint makes the whole of them. Where anything differs, and for a
+    what-if, all is replayed in order. A log that has lost its beginning is replayed from its first checkpoint on.
     progress: called with the number of ticks done. Raises LogError, ConfigError.
     """
     subject = (_base if run.header.extra.get("kind") == "base" else _arm)(run, config)
-    link, memory = subject.link, subject.memory
-    dry = run.header.extra.get("dry") == "1"
-    wire = None if link is None else _Wire(run, link, config is None)
-    check = _Check(run, subject.shown)
+    marks = _marks(run) if subject.robot is not None else []
+    begun = time.perf_counter()
+    first = next(inputs(run.logs, subject.feedbacks), None)
+    if first is None:
+        raise LogError(f"{run.path}: no tick in it")
+    whole = int(first.record["tick"]) == 0
+    if not whole and not marks:
+        raise LogError(f"{run.path}: begins with tick {first.record['tick']}; what was before it is missing")
+    gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
+    done = _at_once(run, subject, marks, whole, progress) if marks and config is None else None
     digest = hashlib.sha256()
-    begun, done = time.perf_counter(), 0
-    for block in _blocks(inputs(run.logs, subject.feedbacks)):
-        if not done:
-            gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
-            if int(block[0].record["tick"]) != 0:
-                raise LogError(f"{run.path}: begins with tick {block[0].record['tick']}; what was before it is missing")
+    if done is None:
+        span = EVERYTHING if whole else (marks[0].time + 1, I64_MAX)
+        done = [_played(run, subject, span, None if whole else marks[0], config is None, digest.update, progress)]
+    gc.unfreeze()
+    for part in done:
+        digest.update(part.sent)
+    seconds, ticks = time.perf_counter() - begun, sum(part.ticks for part in done)
+    full = [part for part in done if part.ticks]
+    return Replay(
+        subject.name, ticks, sum(part.frames for part in done), "" if subject.link is None else digest.hexdigest(),
+        done[0].divergence, done[0].differences, done[0].ignored, seconds, ticks * subject.dt,
+        *(np.concatenate([getattr(part, name) for part in full]) for name in ("time", "logged", "replayed")),
+    )  # fmt: skip
+
+
+def _marks(run: Run) -> list[_Mark]:
+    if schema.CHECKPOINT not in run:
+        return []
+    found = run[schema.CHECKPOINT]
+    return [_Mark(at, text) for at, text in zip(found.time.tolist(), found.payloads, strict=True)]
+
+
+def _at_once(
+    run: Run, subject: _Subject, marks: list[_Mark], whole: bool, progress: Callable[[int], None]
+) -> list[_Part] | None:
+    """Return the spans between the checkpoints, replayed side by side; None unless all of them are as the log says."""
+    jobs = min(len(os.sched_getaffinity(0)), len(marks) + whole)
+    if jobs < 2:
+        return None
+    starts: list[_Mark | None] = [*([None] if whole else []), *marks]
+    ticks = 0
+    # A fork inherits the robot, which takes seconds to build. What it gives back is plain.
+    fork = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(jobs, fork, _inherit, (run, subject, [*starts, None])) as pool:
+        waiting = [pool.submit(_span, k) for k in range(len(starts))]
+        parts = []
+        for each in waiting:
+            part = each.result()
+            if part is None or part.divergence is not None or part.differences or not part.agrees:
+                pool.shutdown(cancel_futures=True)
+                return None
+            parts.append(part)
+            ticks += part.ticks
+            progress(ticks)
+    return parts
+
+
+_inherited: tuple[Run, _Subject, list[_Mark | None]]
+
+
+def _inherit(*given: Any) -> None:
+    global _inherited
+    _inherited = given
+
+
+def _span(k: int) -> _Part | None:
+    run, subject, marks = _inherited
+    begin, end = marks[k], marks[k + 1]
+    sent: list[bytes] = []
+    span = (0 if begin is None else begin.time + 1, I64_MAX if end is None else end.time + 1)
+    try:
+        part = _played(run, subject, span, begin, True, sent.append, lambda n: None, end)
+    except LogError:
+        return None  # in order, it says which
+    return part._replace(sent=b"".join(sent))
+
+
+def _played(
+    run: Run, subject: _Subject, span: tuple[int, int], begin: _Mark | None, compares: bool,
+    sent_on: Callable[[bytes], None], progress: Callable[[int], None], end: _Mark | None = None,
+) -> _Part:  # fmt: skip
+    """Replay the ticks of a span of log_time, from a checkpoint or from the very start, up to one or the very end."""
+    link, memory, expected = subject.link, subject.memory, 0
+    dry = run.header.extra.get("dry") == "1"
+    wire = None if link is None else Wire(run, link, compares, span)
+    if begin is not None:
+        start = _start(run, subject, begin)
+        memory, expected = start.memory, start.memory.tick + 1
+        if wire is not None:
+            wire.go_on(start.counters)
+    check = Check(run, subject.shown)
+    done = 0
+    for block in _blocks(inputs(run.logs, subject.feedbacks, span)):
+        if not done and int(block[0].record["tick"]) != expected:
+            raise LogError(f"{run.path}: goes on with tick {block[0].record['tick']}, wanted {expected}")
         if wire is not None:
             wire.prime(block[0].log_time)
         records, sent = [], []
@@ -204,24 +293,26 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
             records.append(record)
             if link is not None:
                 sent.append(link.write(Command(Drive.DISABLE, command.tau) if dry else command))
-                digest.update(b"".join(sent[-1]))
-        check.compare([logged.record for logged in block], records)
+                sent_on(b"".join(sent[-1]))
+        ticks = check.compare([logged.record for logged in block], records)
         if wire is not None:
-            ticks = [int(logged.record["tick"]) for logged in block]
             wire.compare([logged.log_time for logged in block], ticks, subject.dt, sent)
         done += len(block)
         progress(done)
-    gc.unfreeze()
-    seconds = time.perf_counter() - begun
-    if not done:
-        raise LogError(f"{run.path}: no tick in it")
     found = (check.divergence, None if wire is None else wire.divergence)
     first = min((d for d in found if d is not None), key=lambda d: d.tick, default=None)
-    return Replay(
-        subject.name, done, 0 if wire is None else wire.frames, "" if link is None else digest.hexdigest(), first,
-        check.differences(), check.ignored, seconds, done * subject.dt,
-        np.concatenate(check.time), np.concatenate(check.tau_logged), np.concatenate(check.tau),
-    )  # fmt: skip
+    agrees = end is None or (link is not None and encode_checkpoint(memory, link.counters) == end.text)
+    time, logged_tau, tau = check.drawn()
+    frames = 0 if wire is None else wire.frames
+    return _Part(done, frames, first, check.differences(), check.ignored, time, logged_tau, tau, b"", agrees)
+
+
+def _start(run: Run, subject: _Subject, mark: _Mark) -> Checkpoint:
+    assert subject.robot is not None
+    try:
+        return decode_checkpoint(mark.text, subject.robot, subject.memory)
+    except ValueError as error:
+        raise LogError(f"{run.path}: its checkpoint cannot be used: {error}") from None
 
 
 def _blocks(ticks: Iterator[Logged]) -> Iterator[list[Logged]]:
@@ -238,196 +329,3 @@ def _first_q(run: Run) -> F64:
     if q.shape != (len(run.header.joints),):
         raise LogError(f"{run.path}: its header has no positions of the handshake")
     return q
-
-
-class _Check:
-    """Compares records, block by block."""
-
-    def __init__(self, run: Run, shown: str) -> None:
-        self.run, self.shown = run, shown
-        self.divergence: Divergence | None = None
-        self.ignored: tuple[str, ...] = ()
-        self.time: list[F64] = []
-        self.tau: list[F64] = []
-        self.tau_logged: list[F64] = []
-        self._found: dict[str, Difference] = {}
-
-    def compare(self, logged: list[Any], replayed: list[Any]) -> None:
-        """Take a block of ticks into account."""
-        ours = np.frombuffer(b"".join(record.tobytes() for record in replayed), replayed[0].dtype)
-        theirs = np.frombuffer(b"".join(record.tobytes() for record in logged), logged[0].dtype)
-        self.time.append(np.array(theirs["time"]))
-        self.tau.append(np.array(ours[self.shown]))
-        self.tau_logged.append(np.array(theirs[self.shown]))
-        if ours.dtype == theirs.dtype and ours.tobytes() == theirs.tobytes():
-            return
-        mine, its = (set(a.dtype.names or ()) for a in (ours, theirs))
-        self.ignored = tuple(sorted(mine ^ its))
-        names = [name for name in theirs.dtype.names or () if name in mine and name not in GIVEN]
-        first: tuple[int, str] | None = None
-        for name in names:
-            a, b = theirs[name], ours[name]
-            if a.shape != b.shape:
-                self.ignored = tuple(sorted({*self.ignored, name}))
-                continue
-            rows = np.flatnonzero(_differ(a, b))
-            if not len(rows):
-                continue
-            self._note(name, a, b, rows, theirs["tick"])
-            if first is None or rows[0] < first[0]:
-                first = (int(rows[0]), name)
-        if first is not None and self.divergence is None:
-            self.divergence = self._divergence(theirs[first[0]], ours[first[0]], first[1])
-
-    def _note(self, name: str, a: Any, b: Any, rows: Any, ticks: Any) -> None:
-        with np.errstate(invalid="ignore"):
-            gap = np.abs(a[rows].astype(np.float64) - b[rows].astype(np.float64)).reshape(len(rows), -1)
-        gap[(a[rows] == b[rows]).reshape(gap.shape)] = 0.0  # inf and inf
-        worst = np.where(np.isnan(gap), np.inf, gap).max(axis=1)
-        k = int(worst.argmax())
-        old = self._found.get(name)
-        here = Difference(name, unit_of(name), len(rows), int(ticks[rows[0]]), float(worst[k]), int(ticks[rows[k]]))
-        if old is not None:
-            larger = here if here.largest > old.largest else old
-            here = old._replace(ticks=old.ticks + here.ticks, largest=larger.largest, at=larger.at)
-        self._found[name] = here
-
-    def _divergence(self, a: Any, b: Any, name: str) -> Divergence:
-        one, two = np.atleast_1d(a[name]), np.atleast_1d(b[name])
-        index = np.unravel_index(int(np.flatnonzero(_differ(one.reshape(-1, 1), two.reshape(-1, 1)))[0]), one.shape)
-        x, y = one[index], two[index]
-        part = part_of(name, index, self.run.header.joints) if a[name].shape else ""
-        return Divergence(
-            int(a["tick"]), float(a["time"]), part, name, repr(x.item()), repr(y.item()), size_of(name, x, y)
-        )
-
-    def differences(self) -> tuple[Difference, ...]:
-        """Return the fields that differ, in the order of the record."""
-        return tuple(self._found[name] for name in self.run.header.dtype.names or () if name in self._found)
-
-
-def part_of(name: str, index: tuple[Any, ...], joints: tuple[str, ...]) -> str:
-    """Return what an index of a field means: a joint's name, an axis, an obstacle's slot."""
-    first = int(index[0])
-    if name in ("rho", "force", "point"):
-        return f"obstacle slot {first}" + (f", {'xyz'[int(index[1])]}" if len(index) > 1 else "")
-    if name in ("x", "xd", "omega", "goal"):
-        return "xyz"[first]
-    if name in ("wxyz", "goal_wxyz"):
-        return "wxyz"[first]
-    if name == "F":
-        return ("x", "y", "z", "rx", "ry", "rz")[first]
-    return joints[first] if first < len(joints) else str(first)
-
-
-def _differ(a: Any, b: Any) -> Any:
-    """Return the rows that differ in a bit."""
-    kind = {8: np.uint64, 4: np.uint32}[a.dtype.itemsize]
-    bits = (np.ascontiguousarray(a).view(kind) != np.ascontiguousarray(b).view(kind)).reshape(len(a), -1)
-    return bits.any(axis=1)
-
-
-class _Wire:
-    """Compares command frames with those that the log holds for the same ticks."""
-
-    def __init__(self, run: Run, link: CanLink, compares: bool) -> None:
-        self.link = link
-        self.frames = 0
-        self.divergence: Divergence | None = None
-        compares = compares and any(run.count(schema.can_topic(bus)) for bus in run.header.buses[:1])
-        self._sent = _sent_frames(run) if compares else iter(())
-        self._waiting: Structured = np.zeros(0, CAN_ROW)
-        self._time: I64 = np.zeros(0, np.int64)
-        self._ended = not compares
-        self._primed = False
-        self._counted = _counters(run, len(link.spec.joints))
-        self._joint = {joint.can_id: joint.name for joint in link.spec.joints}
-        self._size = frame.CANFD_MTU if link.spec.fd else frame.CAN_MTU
-
-    def _fill(self, until: int) -> None:
-        """Read on until every frame up to a log_time [ns] is there."""
-        while not self._ended and (not len(self._time) or self._time[-1] <= until):
-            more = next(self._sent, None)
-            if more is None:
-                self._ended = True
-                return
-            self._time = np.concatenate([self._time, more[0]])
-            self._waiting = stacked([self._waiting, more[1]], CAN_ROW)
-
-    def prime(self, time: int) -> None:
-        """Continue the counters of the log, which the handshake has moved: those of its first commands, less one."""
-        if self._primed:
-            return
-        self._primed = True
-        if self._counted:
-            for j, counter in enumerate(self._counted):
-                self.link.set_counter(j, counter)
-            return
-        self._fill(time)
-        if not self.link.protected:
-            return
-        ids = [joint.can_id for joint in self.link.spec.joints]
-        for j, can_id in enumerate(ids):
-            rows = np.flatnonzero((self._waiting["id"] == can_id) & (self._time >= time))
-            if len(rows):
-                self.link.set_counter(j, int(self._waiting["data"][rows[0], COUNTER_AT]) - 1)
-
-    def compare(self, times: list[int], ticks: list[int], period: float, frames: list[list[bytes]]) -> None:
-        """Take a block of ticks into account: the frames of a tick carry its log_time."""
-        if self._ended and not len(self._time):
-            return
-        self._fill(times[-1])
-        cut = int(np.searchsorted(self._time, times[-1], side="right"))
-        logged, stamps = self._waiting[:cut], self._time[:cut]
-        self._waiting, self._time = self._waiting[cut:], self._time[cut:]
-        keep = np.isin(stamps, times)  # frames of no tick are the daemon's own stop frames
-        logged, stamps = logged[keep], stamps[keep]
-        raw = np.frombuffer(b"".join(f for each in frames for f in each), np.uint8).reshape(-1, self._size)
-        owner = np.repeat(np.arange(len(times)), [len(each) for each in frames])
-        self.frames += len(logged)
-        if len(raw) == len(logged):
-            ids = raw[:, :4].copy().view("<u4").reshape(-1)
-            same = (ids == logged["id"]) & (raw[:, 4] == logged["dlc"])
-            same &= (raw[:, 8:] == logged["data"][:, : self._size - 8]).all(axis=1)
-            same &= stamps == np.array(times)[owner]
-            if same.all():
-                return
-            row = int(np.flatnonzero(~same)[0])
-        else:
-            row = _first_gap(stamps, np.array(times)[owner])
-        if self.divergence is None:
-            at = int(owner[min(row, len(owner) - 1)]) if len(owner) else 0
-            self.divergence = self._divergence(ticks[at], period, row, raw, logged)
-
-    def _divergence(self, tick: int, period: float, row: int, raw: Any, logged: Any) -> Divergence:
-        ours = bytes(raw[row, 8 : 8 + int(raw[row, 4])]) if row < len(raw) else b""
-        its = bytes(logged["data"][row, : int(logged["dlc"][row])]) if row < len(logged) else b""
-        can_id = int(logged["id"][row]) if row < len(logged) else int.from_bytes(raw[row, :4].tobytes(), "little")
-        places = [i for i, (a, b) in enumerate(zip(its, ours, strict=False)) if a != b]
-        size = f"bytes {', '.join(map(str, places))}" if places and ours and its else "a frame that the other lacks"
-        joint = self._joint.get(can_id, f"{can_id:03X}")
-        return Divergence(tick, tick * period, joint, "frame", its.hex() or "none", ours.hex() or "none", size)
-
-
-def _counters(run: Run, n: int) -> list[int]:
-    """Return the counters of the handshake that the header tells, [] when it does not."""
-    try:
-        found = [int(c) for c in json.loads(run.header.extra.get("counters", "[]"))]
-    except (ValueError, TypeError):
-        found = []
-    return found if len(found) == n else []
-
-
-def _first_gap(one: I64, two: I64) -> int:
-    n = min(len(one), len(two))
-    rows = np.flatnonzero(one[:n] != two[:n])
-    return int(rows[0]) if len(rows) else n
-
-
-def _sent_frames(run: Run) -> Iterator[tuple[I64, Structured]]:
-    """Yield log_time and the command frames of the first bus, piece by piece."""
-    topic = schema.can_topic(run.header.buses[0]) if run.header.buses else ""
-    for piece in run.pieces(topic):
-        array = piece.array
-        mine = array["direction"] == schema.TX
-        yield piece.time[mine], array[mine]

@@ -13,10 +13,11 @@ from rtctl.control.pipe import initial, tick
 from rtctl.control.robot import Robot
 from rtctl.hal.can import CanLink
 from rtctl.hal.clock import Slot
+from rtctl.log import checkpoint
 from rtctl.log.request import encode_event, encode_request
 from rtctl.types import Command, Drive, Feedback, Record, Request, Status, Task
 
-TICK, CAN_TX, CAN_RX, EVENT, REQUEST = 1, 2, 3, 4, 5  # kinds of the log's messages
+TICK, CAN_TX, CAN_RX, EVENT, REQUEST, CHECKPOINT = 1, 2, 3, 4, 5, 9  # kinds of the log's messages
 QUIET = Request()
 
 
@@ -35,6 +36,7 @@ class Machine(NamedTuple):
     harmless: Callable[[Any], Any]  # what a command becomes in a dry run
     rx: int  # kind of the log's messages
     tx: int
+    kept: Callable[[Any, Any], bytes | None] | None = None  # (memory, counters) -> checkpoint; None: there are none
 
 
 class Turn(NamedTuple):
@@ -133,6 +135,11 @@ class Servo:
         self.sink.put_many(self.machine.rx, self.link.received, stamp)
         self.sink.put_many(TICK, [record.tobytes()], stamp)
         self.sink.put_many(self.machine.tx, frames, stamp)
+        kept = self.machine.kept
+        if kept is not None and checkpoint.due(self.memory.tick, self.robot.dt):
+            text = kept(self.memory, self.link.counters)
+            if text is not None:
+                self.sink.put_many(CHECKPOINT, [text], stamp)
         if news:
             self.sink.put_many(EVENT, [encode_event(self.memory.tick, now, *each) for each in news], stamp)
 
@@ -159,4 +166,5 @@ ARM = Machine(
     harmless=lambda command: command._replace(drive=Drive.DISABLE),
     rx=CAN_RX,
     tx=CAN_TX,
+    kept=checkpoint.encode_checkpoint,
 )

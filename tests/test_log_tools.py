@@ -22,6 +22,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 from rosbags.typesys import Stores, get_typestore
 
+from rtctl import compare
 from rtctl import config as cfg
 from rtctl.cli import main
 from rtctl.control.record import record_dtype
@@ -133,16 +134,16 @@ def test_a_changed_command_byte_is_found_on_the_wire(log: Path, tmp_path: Path, 
 
     monkeypatch.setattr(module, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
     run = read_run(log)
-    original = module._sent_frames
+    original = compare._sent_frames
 
-    def flipped(of: Any) -> Any:
-        for stamps, array in original(of):
+    def flipped(of: Any, span: Any) -> Any:
+        for stamps, array in original(of, span):
             array = array.copy()
             row = np.flatnonzero((stamps == 400_000_000) & (array["id"] == 5))
             array["data"][row, 7] ^= 1
             yield stamps, array
 
-    monkeypatch.setattr(module, "_sent_frames", flipped)
+    monkeypatch.setattr(compare, "_sent_frames", flipped)
     done = replay(run)
     assert done.divergence is not None
     assert (done.divergence.tick, done.divergence.joint, done.divergence.field) == (400, "panda_joint5", "frame")

@@ -17,6 +17,11 @@ from rtctl.types import I64, U8
 
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
 LEVELS = {"rejected": WARNING, "fault": ERROR}  # by the event's name
+TEXTS = {
+    int(Kind.EVENT): schema.EVENT,
+    int(Kind.REQUEST): schema.REQUEST,
+    int(Kind.CHECKPOINT): schema.CHECKPOINT,
+}  # JSON
 EVIDENCE = 50  # ticks that are kept with a fault
 SHOWN = (  # of each tick in a fault's evidence
     "tick", "time", "missed", "link", "q", "qd", "tau_measured", "age", "replies", "drive", "lateness", "x", "error",
@@ -173,7 +178,7 @@ class Encoder:
             parts = [(channel, 0)]
         elif base in (Kind.MAV_TX, Kind.MAV_RX) and kind >> 8 < len(self.header.links):
             return self._packets(kind, rows, payloads, time, sequence, pieces)
-        elif kind in (Kind.EVENT, Kind.REQUEST):
+        elif kind in TEXTS:
             return self._texts(kind, rows, payloads, stamp, sequence, pieces)
         else:
             self.malformed += len(rows)
@@ -240,7 +245,7 @@ class Encoder:
     def _texts(
         self, kind: int, rows: I64, payloads: list[Payload], stamp: I64, sequence: I64, pieces: list[Payload]
     ) -> list[tuple[I64, int, I64, I64, int]]:
-        channel = self._id[schema.EVENT if kind == Kind.EVENT else schema.REQUEST]
+        channel = self._id[TEXTS[kind]]
         times, sequences = stamp.tolist(), sequence.tolist()
         for number, row in enumerate(rows.tolist()):
             data = bytes(payloads[number])

@@ -17,6 +17,7 @@ class Kind(IntEnum):
     SENTINEL = 6  # JSON: why the producer closes the log
     MAV_TX = 7  # one MAVLink packet; add `link << 8` for the link of that index in `Header.links`
     MAV_RX = 8
+    CHECKPOINT = 9  # JSON of `checkpoint.encode_checkpoint`
 
 
 _RX = int(Kind.CAN_RX)  # comparing with the enum's member takes longer than a put should

@@ -10,9 +10,11 @@ from rtctl.log import schema
 from rtctl.log.reader import Log
 from rtctl.log.request import decode_request
 from rtctl.log.topic import Structured
+from rtctl.log.walk import I64_MAX
 from rtctl.types import Feedback, Request
 
 QUIET = Request()
+EVERYTHING = (0, I64_MAX)
 
 
 class Logged(NamedTuple):
@@ -63,15 +65,21 @@ def requests_of(log: Log) -> dict[int, Request]:
     return found
 
 
-def inputs(logs: Iterable[Log], feedbacks: Callable[[Structured], Iterable[Any]] = feedbacks_of) -> Iterator[Logged]:
+def inputs(
+    logs: Iterable[Log],
+    feedbacks: Callable[[Structured], Iterable[Any]] = feedbacks_of,
+    span: tuple[int, int] = EVERYTHING,
+) -> Iterator[Logged]:
     """Yield the ticks of a log's segments, in order; `feedbacks` makes them of records, an arm's unless given.
+
+    span: of log_time [ns] from which to which, that one not included.
 
     Raises LogError where a tick is missing: what follows depends on it.
     """
     expected = -1
     for log in logs:
         requests = requests_of(log)
-        for piece in log.pieces(schema.TICK):
+        for piece in log.pieces(schema.TICK) if span == EVERYTHING else (log.window(schema.TICK, *span),):
             records = piece.array
             ticks, times = records["tick"].tolist(), piece.time.tolist()
             for k, (tick, feedback) in enumerate(zip(ticks, feedbacks(records), strict=True)):

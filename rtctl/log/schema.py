@@ -23,6 +23,7 @@ LOG = "/log"
 TF = "/tf"
 SCENE = "/scene"
 REQUEST = "/request"
+CHECKPOINT = "/checkpoint"
 DROPOUT = "/log/dropout"
 SENTINEL = "/log/sentinel"
 POSITION = "/log/position"
@@ -251,6 +252,17 @@ _EVENT_SCHEMA = _json_schema(
 _REQUEST_SCHEMA = _json_schema(
     "rtctl.Request", {"tick": _INTEGER, "verb": _INTEGER, "goal": _OBJECT, "obstacles": {"type": "array"}}, ("tick",)
 )
+_CHECKPOINT_SCHEMA = _json_schema(
+    "rtctl.Checkpoint",
+    {
+        "tick": _INTEGER,
+        "layout": {"type": "string", "description": "fields that the program kept: another version cannot use it"},
+        "counters": {"type": "array", "description": "of each joint's newest protected frame"},
+        "memory": {"type": "array", "description": "of the tick; arrays by type and shape"},
+        "data": {"type": "string", "contentEncoding": "base64", "description": "the arrays' bytes, one behind another"},
+    },
+    ("tick",),
+)
 _DROPOUT_SCHEMA = _json_schema("rtctl.Dropout", {"count": _INTEGER, "from_ns": _INTEGER, "to_ns": _INTEGER}, ("count",))
 _SENTINEL_SCHEMA = _json_schema("rtctl.Sentinel", {"reason": _STRING, "detail": _STRING}, ("reason",))
 _POSITION_SCHEMA = _json_schema("rtctl.Position", {"entries": _INTEGER}, ("entries",))
@@ -265,6 +277,7 @@ def channels(header: Header) -> tuple[Channel, ...]:
         (JOINT_STATES, "cdr", "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE_MSG.encode()),
         (EVENT, "json", "rtctl.Event", "jsonschema", _EVENT_SCHEMA),
         (REQUEST, "json", "rtctl.Request", "jsonschema", _REQUEST_SCHEMA),
+        (CHECKPOINT, "json", "rtctl.Checkpoint", "jsonschema", _CHECKPOINT_SCHEMA),
         (DROPOUT, "json", "rtctl.Dropout", "jsonschema", _DROPOUT_SCHEMA),
         (SENTINEL, "json", "rtctl.Sentinel", "jsonschema", _SENTINEL_SCHEMA),
         (POSITION, "json", "rtctl.Position", "jsonschema", _POSITION_SCHEMA),
