@@ -330,8 +330,7 @@ def test_the_speed_limit_holds(monkeypatch: Patch):
     interpreted(monkeypatch)
     assert within_the_speed_limit()
 
-    def unlimited(e: F64, e_rot: F64, *rest: Any) -> Any:
-        k = rest[6]  # after v, w, Jbar, qd_free, qd_max, bias
+    def unlimited(e: F64, e_rot: F64, v: F64, w: F64, Jbar: F64, free: F64, qd_max: F64, k: float, *a: Any) -> Any:
         return k * e, k * e_rot
 
     monkeypatch.setattr(law, "velocity_reference", unlimited)

@@ -286,8 +286,7 @@ void law(const double *const *a, const double *s, const int64_t *link, int n, in
     double tau_drive[N], tau_brake[N], tau_rest[N], tau_damp[N], tau_field[N];
     double limits[N], sum[N], k = s[KP] / s[KV];
     double sv = wanted(a[E], k, s[V_MAX], s[A_MAX]), sw = wanted(a[E_ROT], k, s[W_MAX], s[ALPHA_MAX]);
-    double turn = std::sqrt(dot(a[JDQD], a[JDQD], 3)), roll = std::sqrt(dot(a[JDQD] + 3, a[JDQD] + 3, 3));
-    double scale = 1 / std::max({1.0, turn / s[A_MAX], roll / s[ALPHA_MAX]});
+    double scale = 1;
     for (int i = 0; i < n; i++) {
         double qd = 0, tip = 0;  // asked of the joint; what the tip's motion needs of it
         for (int j = 0; j < 3; j++) {

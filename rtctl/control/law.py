@@ -163,8 +163,8 @@ def _evaluate(
     tau_rate, qd_max, dt = c.tau_rate[:n].copy(), pace * c.qd_max[:n], c.dt
     qd_free = qd - matvec(space.Jbar, np.concatenate((xd, omega)))
     v, w = velocity_reference(
-        e, e_rot, v_ref, w_ref, space.Jbar, qd_free, qd_max, model.Jdqd, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max,
-        p.alpha_max, p.speed_margin, dt,
+        e, e_rot, v_ref, w_ref, space.Jbar, qd_free, qd_max, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max,
+        p.speed_margin, dt,
     )  # fmt: skip
     F, tau_drive, tau_brake, tau_rest, tau_damp = motion_torque(
         model.J, model.Jdqd, space.Lambda, space.NT, model.A, xd, omega, v, w, q, qd, q_rest,

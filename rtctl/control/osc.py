@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 from rtctl.control.linalg import matmul, matvec, symmetric_eigen, tmatvec
-from rtctl.control.scan import norm
 from rtctl.types import F64
 
 SPEED_FLOOR = 0.2  # fraction of qd_max that the null space cannot take from the tip: it never stands still for it
@@ -142,7 +141,6 @@ def velocity_reference(
     Jbar: F64,
     qd_free: F64,
     qd_max: F64,
-    bias: F64,
     k: float,
     v_max: float,
     a_max: float,
@@ -156,14 +154,10 @@ def velocity_reference(
     e = x_goal - x [m], e_rot the rotation vector to the goal [rad]. The pair is scaled as one so that no joint is asked
     for more than margin * qd_max (qd = Jbar [v; w] + qd_free, the latter (n,) of the null space [rad/s]): near a
     singularity, or while the posture moves, the tip slows; it does not leave its line.
-
-    bias (6,) = Jd qd is the acceleration of a tip whose joints keep their speeds, which the motion must take back to
-    stay on its line. Where it passes a_max or alpha_max the pair slows in proportion: through a singularity joints
-    could otherwise be as fast as qd_max, and what they do when it lets go of them no torque rate would catch.
     """
     v = _desired(e, k, v_max, a_max)
     w = _desired(e_rot, k, w_max, alpha_max)
-    scale = 1.0 / max(1.0, norm(bias[:3]) / a_max, norm(bias[3:]) / alpha_max)
+    scale = 1.0
     for i in range(Jbar.shape[0]):
         qd = 0.0
         for j in range(3):

@@ -85,8 +85,8 @@ class Mass:
     def _pull(self, x: F64, v: F64, goal: F64, p: MotionParams, v_ref: F64, w_ref: F64) -> tuple[F64, F64, F64]:
         """Return the slewed references and the force (3,) of the motion task: tau = J^T Lambda F*."""
         v_ref, w_ref = velocity_reference(
-            goal - x, ZERO3, v_ref, w_ref, J6.T.copy(), ZERO3, FAST, ZERO6, p.k_p / p.k_v, p.v_max, p.a_max,
-            p.w_max, p.alpha_max, p.speed_margin, self.dt,
+            goal - x, ZERO3, v_ref, w_ref, J6.T.copy(), ZERO3, FAST, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max,
+            p.alpha_max, p.speed_margin, self.dt,
         )  # fmt: skip
         _, drive, brake, _, _ = motion_torque(
             J6, ZERO6, LAMBDA, np.zeros((3, 3)), EYE, v, ZERO3, v_ref, w_ref, x, v, x, p.k_v, p.k_q, p.d_q,
