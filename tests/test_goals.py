@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.control.goals import Progress, arrived, at_rest, refusal
+from rtctl.control.goals import Progress, arrived, at_rest, gained, refusal, time_left
 from rtctl.types import Goal, Task
 
 FAR = np.full(3, np.inf)
@@ -68,3 +68,21 @@ def test_at_rest_is_slow_in_both():
     assert at_rest(STUCK)
     assert not at_rest(STUCK._replace(speed=0.02))
     assert not at_rest(STUCK._replace(rate=0.1))
+
+
+def test_what_is_left_is_the_slower_of_way_and_turn():
+    assert time_left(STUCK, 0.5, 1.0) == 0.1
+    assert time_left(STUCK._replace(error_rot=0.3), 0.5, 1.0) == 0.3
+
+
+@pytest.mark.parametrize(
+    ("left", "more"),
+    [(2.0, False), (1.95, False), (1.89, True), (2.5, False)],  # in 2 s, of which a twentieth counts
+)
+def test_who_comes_nearer_at_less_than_a_twentieth_of_full_speed_gains_nothing(left: float, more: bool):
+    assert gained(left, 2.0, 2.0) == more
+
+
+def test_near_the_goal_half_of_what_is_left_is_a_gain():
+    assert gained(0.009, 0.02, 2.0)
+    assert not gained(0.011, 0.02, 2.0)

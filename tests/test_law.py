@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
+from rtctl.control.arm_field import own_field
 from rtctl.control.guards import SPEED_BAND, SPEED_HORIZON, approach_rows, fitting, guard, joint_bounds, tip_row
 from rtctl.control.law import Law, evaluate_law, moved_points
 from rtctl.control.model import Model
@@ -302,3 +303,24 @@ def test_an_obstacle_of_any_kind_reaches_the_torque():
         law = law_at(PANDA_HOME, obstacles=with_shape(obstacles_empty(robot().slots), 0, shape))
         assert np.abs(law.tau_obstacles).max() > 0.01, kind
         assert law.force[0, 2] > 0.0, kind
+
+
+def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch():
+    """A kilogram between them, torque that takes 20 ms to brake: their field alone throws them back at 1.9 m/s."""
+    arm, eye, least, back = robot(), np.eye(3), np.inf, 0.0
+    field, row = arm.self_avoid, np.array([[1.0, 0.0, 0.0]])
+    x, v, sent, step = arm.own.reach, -0.5, 0.0, 0.25  # [m], [m/s], [N], [N] in a period
+    for _ in range(400):
+        qd, rho = np.array([v, 0.0, 0.0]), np.array([x if x < arm.own.reach else np.inf])
+        push, _, _ = own_field(rho, row, ZERO, qd, eye, field)
+        rows, bounds = approach_rows(
+            np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 0)), np.zeros((0, 3, 3)), rho, row, ZERO,
+            eye, qd, arm.avoid.rho0, field.rho_min, arm.motion.a_max, np.full(3, 1e3 * step),
+        )  # fmt: skip
+        low = np.full(3, -1e6)
+        added, _ = guard(eye, eye, push, low, -low, rows, bounds)
+        sent += np.clip((push + added)[0] - sent, -step, step)
+        v, x = v + 1e-3 * sent, x + 1e-3 * v
+        least, back = min(least, x), max(back, v)
+    assert least > 0.5 * field.rho_min
+    assert back < 0.25  # half of what it came with

@@ -94,6 +94,23 @@ def test_a_scenario_of_each_robot_breaks_nothing(name: str):
     assert run.joint_speed > 0.05  # it did move
 
 
+@pytest.mark.parametrize(("name", "index", "until"), [("ur5", 10, 1.0), ("openarm", 66, 0.9)])
+def test_what_went_wrong_once_holds(name: str, index: int, until: float):
+    """A forearm that meets its own shoulder at v_max; a way past a singularity, with joints fit for 17 rad/s."""
+    arm, config = robot_of(name)
+    run = play(scenario_of(arm, config, 0, index) | {"duration_s": until}, index)
+    assert judge.failures(arm, run) == []
+
+
+def test_an_arm_that_creeps_along_a_joint_limit_is_said_to_be_held_by_it():
+    """Its tip slides on at a few mm/s for ever: at rest it never is, and it gets nowhere."""
+    arm, config = robot_of("puma560")
+    run = play(scenario_of(arm, config, 0, 72) | {"obstacle": [], "duration_s": 4.6}, 72)
+    assert (run.status, run.detail) == ("limited", "joint_1 at its upper limit")
+    assert run.diagnosis == ""  # true of the plant's own joint
+    assert run.margin < arm.limit.rho0[0]
+
+
 def test_the_column_run_down_is_no_violation_of_any_bound():
     """A ball drives through the shoulder: the arm cannot flee, and does not whirl about for it."""
     ball = {

@@ -197,8 +197,8 @@ def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[
         raise ConfigError(place, config.avoid.clearance_m, wanted)
     q_min, q_max = (np.array([getattr(j, key) for j in config.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
     if config.avoid.self_collision:
-        # measured a little beyond the influence, so that no link can come into it between two evaluations
-        reach = config.avoid.self_influence_m + 0.02
+        # beyond the influence by what stops a link before it, and a little, that none comes there between evaluations
+        reach = config.avoid.self_influence_m + 0.02 + rules.braking_distance(config)
         own = watched(body, q_min, q_max, home, config.avoid.self_influence_m, reach)
     else:
         own = nothing()

@@ -13,6 +13,8 @@ from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
 
+GAIN = 0.05  # of full speed: who comes nearer more slowly is held by something
+
 
 class Progress(NamedTuple):
     """How far the tip is from its goal, and how fast."""
@@ -63,3 +65,21 @@ def arrived(p: Progress, goal: Goal) -> bool:
 def at_rest(p: Progress) -> bool:
     """Return whether the tip is still."""
     return p.speed < STILL_SPEED and p.rate < 4.0 * STILL_SPEED
+
+
+def slow(p: Progress) -> bool:
+    """Return whether the tip does not get anywhere at this speed."""
+    return p.speed < 4.0 * STILL_SPEED and p.rate < 16.0 * STILL_SPEED
+
+
+def time_left(p: Progress, v_max: float, w_max: float) -> float:
+    """Return the time [s] that the goal is away at full speed [m/s], [rad/s]."""
+    return max(p.error / v_max, p.error_rot / w_max)
+
+
+def gained(left: float, nearest: float, window: float) -> bool:
+    """Return whether the goal came nearer, from `nearest` to `left` [s] away, as much as counts in `window` [s].
+
+    That is GAIN of full speed, or half of what was left: the last of a way is slow.
+    """
+    return left < nearest - min(GAIN * window, 0.5 * nearest)

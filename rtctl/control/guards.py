@@ -108,14 +108,16 @@ def tip_row(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64)
 @njit(cache=True, fastmath=False)
 def approach_rows(
     near: I64, link: I64, distances: F64, Jp: F64, own_rho: F64, own_row: F64, dq: F64, A_inv: F64, qd: F64,
-    rho0: float, own_rho0: float, braking: float, tau_rate: F64,
+    rho0: float, own_stop: float, braking: float, tau_rate: F64,
 ) -> tuple[F64, F64]:  # fmt: skip
     """Return rows (r, n) along which links come nearer to what they must not touch, and bounds (r,) of row qdd.
 
     near (K,): slots at hand are >= 0; link (m,); distances (K, >= 4, m): rho [m] and normal of every point, of which
     the nearest of a link count and those within ABREAST of it: a link also turns; Jp (>= m, 3, n). own_rho (L,),
-    own_row (L, n), dq: as in `own_field`. It is the arm's own approach -row qd alone that is bounded, as if with
-    braking [m/s2]; what comes towards it is for the field to flee.
+    own_row (L, n), dq: as in `own_field`; every pair that is measured counts, and stops at own_stop [m], where its
+    field has the strength to turn it: that field is thin and steep, and torque that is slewed comes too late for a
+    link that enters it fast. It is the arm's own approach -row qd alone that is bounded, as if with braking [m/s2];
+    what comes towards it is for the field to flee.
     """
     n = qd.shape[0]
     rows, rooms = np.empty((PAIRS, n)), np.empty(PAIRS)
@@ -139,8 +141,8 @@ def approach_rows(
                 count += 1
     for s in range(own_rho.shape[0]):
         room = own_rho[s] + _dot(own_row[s], dq) if own_rho[s] < np.inf else np.inf
-        if room < own_rho0 and count < PAIRS:
-            rows[count], rooms[count] = -own_row[s], room
+        if room < np.inf and count < PAIRS:
+            rows[count], rooms[count] = -own_row[s], room - own_stop
             count += 1
     bounds = np.empty(count)
     for r in range(count):

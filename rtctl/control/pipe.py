@@ -94,7 +94,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         task=robot.axes, axis=TOOL_Z, evaluated=True, phase=0.0, qdd=zero, q_previous=q, age_previous=zero,
         watch=watch.fresh(robot.n), rest=0,
         goal=None, hold=hold_at(model.x, model.R, robot.axes), holders=0, held=(), escape=Escape(), tau_obstacles=zero,
-        q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0, world=table,
+        q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0,
+        nearest=np.inf, stuck=0, world=table,
         rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,
     )  # fmt: skip
 
@@ -226,7 +227,7 @@ def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
 
 
 def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progress) -> Memory:
-    """Level of competence: what the arm is doing about its goal, and once it rests, what holds it."""
+    """Level of competence: what the arm is doing about its goal, and once it rests or creeps, what holds it."""
     goal = m.goal
     if goal is None or m.state != State.RUN:
         return m if m.status == Status.NO_GOAL else free_of_goals(m)
@@ -235,15 +236,31 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progr
     if m.escape.active or m.escape.phase == escape.Phase.CHOOSING:
         return m._replace(status=Status.ESCAPING, still=0)  # held by what it circulates
     still = m.still + 1 if goals.at_rest(p) else 0
-    m, stall = m._replace(still=still), round(robot.stop.stall / robot.dt)
-    if robot.escape and still == round(escape.STALL / robot.dt) and m.escape.phase == escape.Phase.NONE:
+    m, stall = _approached(robot, m, p)._replace(still=still), round(robot.stop.stall / robot.dt)
+    circles = robot.escape and m.escape.phase == escape.Phase.NONE
+    if circles and still == round(escape.STALL / robot.dt):
         return _caught(robot, m, law, permitted, goal, p.error)
-    if still < stall:
+    idle = max(still, m.stuck if goals.slow(p) else 0)
+    if idle < stall:
         return _with_status(m, Status.MOVING)
-    if (still - stall) % round(REVIEW / robot.dt):
+    if (idle - stall) % round(REVIEW / robot.dt):
         return m
+    if circles and still < stall:  # it creeps
+        begun = _caught(robot, m, law, permitted, goal, p.error)
+        if begun.status == Status.ESCAPING:
+            return begun
     found = competence.held(competence.balance(robot, m, law, permitted.tau_wanted))
+    if still < stall and found.status == Status.LOCAL_MINIMUM and not found.mask:
+        return _with_status(m, Status.MOVING)  # slow, and nothing is in its way
     return _with_held(robot, m, law, found)._replace(status=found.status)
+
+
+def _approached(robot: Robot, m: Memory, p: Progress) -> Memory:
+    """Return the memory with how near the goal has been, and since when it has not come nearer."""
+    left = goals.time_left(p, robot.motion.v_max, robot.motion.w_max)
+    if goals.gained(left, m.nearest, robot.stop.stall):
+        return m._replace(nearest=left, stuck=0)
+    return m._replace(stuck=m.stuck + 1)
 
 
 def _with_status(m: Memory, status: Status) -> Memory:

@@ -200,7 +200,10 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
 
 def free_of_goals(m: Memory) -> Memory:
     """Return the memory without a goal and what was known of it."""
-    return m._replace(goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, escape=Escape())
+    return m._replace(
+        goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, nearest=np.inf, stuck=0,
+        escape=Escape(),
+    )  # fmt: skip
 
 
 def _is_posture(robot: Robot, q: np.ndarray) -> bool:

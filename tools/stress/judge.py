@@ -7,6 +7,8 @@ import numpy as np
 from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
 from rtctl.control.robot import Robot
+from rtctl.control.so3 import R_of
+from rtctl.control.task import error_of
 from rtctl.servo import Servo
 from rtctl.types import F64
 
@@ -18,6 +20,9 @@ AT_LIMIT = 0.85  # of the bound on torque, joint speed or tip speed
 TIP_TOLERANCE = 0.02  # of v_max
 OVERHANG = 0.03  # [m] farthest that the spheres which the controller knows reach beyond the links
 REST = 0.012  # [m/s] mean speed of a tip at rest
+CREEP = 0.03  # [m/s] mean speed of a tip that creeps at most
+SLOW = 0.04  # of full speed: who comes nearer more slowly does not move towards the goal
+LATE = 0.7  # [s] by which a diagnosis may come later than the stall that it tells
 SINGULAR = 2.0  # times the threshold of damping: the state of now, not of the moment of the diagnosis
 
 
@@ -65,6 +70,8 @@ def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
     wide = robot.avoid.rho0 + robot.avoid.look_ahead * 0.5 * robot.motion.v_max
     stall = round(robot.stop.stall / robot.dt)
     rest = _speed(watch.path_of[-stall:], robot.dt) if len(watch.path_of) > stall else np.inf
+    if status == "moving" and _creeps(servo, watch):
+        return "moving, yet it gets no nearer to its goal"
     if status in ("moving", "escaping"):
         return "" if rest > REST or m.still < stall else f"{status}, at {1e3 * rest:.1f} mm/s for {robot.stop.stall} s"
     if rest > 4.0 * REST and status != "shadowed":
@@ -77,6 +84,20 @@ def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
         bound = SINGULAR * robot.motion.epsilon
         return "" if sigma < bound else f"{status}, with {sigma:.3g} of {robot.motion.epsilon:g}"
     return f"status {status} of an arm {watch.legs[-1].error:.3f} m short"
+
+
+def _creeps(servo: Servo, watch: "Watch") -> bool:
+    """Return whether a tip has come nearer to its goal by no pace worth the word for longer than a diagnosis takes."""
+    m, robot = servo.memory, servo.robot
+    assert m.goal is not None
+    rows = range(len(watch.path_of) - round((robot.stop.stall + LATE) / robot.dt), len(watch.path_of), 20)
+    if rows.start < 0 or _speed(watch.path_of[rows.start :], robot.dt) > CREEP:
+        return False
+    left = []
+    for k in rows:
+        error, turn = error_of(m.goal, watch.path_of[k], R_of(watch.turn_of[k]))
+        left.append(max(error / robot.motion.v_max, turn / robot.motion.w_max))
+    return left[0] - min(left) < min(SLOW * robot.stop.stall, 0.4 * left[0])
 
 
 def _untrue(servo: Servo, plant: Plant, wide: float, status: str, detail: str) -> str:

@@ -77,6 +77,7 @@ class Watch(Tally):
         self.ticks = 0
         self.trace: list[tuple[float, float, float]] = []  # torque, joint speed, tip speed ratios, a row a period
         self.path_of: list[F64] = []  # tip, a row a period
+        self.turn_of: list[F64] = []  # its quaternion
 
     def truth(self) -> Truth:
         """Return the truth of now; clearances as last measured."""
@@ -104,6 +105,7 @@ class Watch(Tally):
             )
         )
         self.path_of.append(truth.tip)
+        self.turn_of.append(truth.tip_wxyz)
 
 
 def _numbers(record: Any) -> bool:
