@@ -189,8 +189,8 @@ class Wire:
             if len(rows):
                 self.link.set_counter(j, int(self._waiting["data"][rows[0], COUNTER_AT]) - 1)
 
-    def compare(self, times: list[int], ticks: list[int], period: float, frames: list[list[bytes]]) -> None:
-        """Take a block of ticks into account: the frames of a tick carry its log_time."""
+    def compare(self, times: list[int], ticks: list[int], period: float, frames: list[bytes]) -> None:
+        """Take a block of ticks into account, each with all its frames: in the log they carry its log_time."""
         if self._ended and not len(self._time):
             return
         self._fill(times[-1])
@@ -199,8 +199,8 @@ class Wire:
         self._waiting, self._time = self._waiting[cut:], self._time[cut:]
         keep = np.isin(stamps, times)  # frames of no tick are the daemon's own stop frames
         logged, stamps = logged[keep], stamps[keep]
-        raw = np.frombuffer(b"".join(f for each in frames for f in each), np.uint8).reshape(-1, self._size)
-        owner = np.repeat(np.arange(len(times)), [len(each) for each in frames])
+        raw = np.frombuffer(b"".join(frames), np.uint8).reshape(-1, self._size)
+        owner = np.repeat(np.arange(len(times)), [len(each) // self._size for each in frames])
         self.frames += len(logged)
         if len(raw) == len(logged):
             ids = raw[:, :4].copy().view("<u4").reshape(-1)

@@ -292,8 +292,8 @@ def _played(
             memory, command, record = subject.tick(memory, logged.feedback, logged.request)
             records.append(record)
             if link is not None:
-                sent.append(link.write(Command(Drive.DISABLE, command.tau) if dry else command))
-                sent_on(b"".join(sent[-1]))
+                sent.append(b"".join(link.write(Command(Drive.DISABLE, command.tau) if dry else command)))
+                sent_on(sent[-1])
         ticks = check.compare([logged.record for logged in block], records)
         if wire is not None:
             wire.compare([logged.log_time for logged in block], ticks, subject.dt, sent)

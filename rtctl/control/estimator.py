@@ -14,7 +14,7 @@ from numba import njit
 
 from rtctl.control.linalg import matvec
 from rtctl.control.so3 import compose, error, exp3, orthonormal
-from rtctl.types import B1, F64
+from rtctl.types import B1, F64, I64
 
 
 class EstimatorParams(NamedTuple):
@@ -128,15 +128,15 @@ def joint_start(q: F64, P: F64) -> JointEstimate:
 
 
 def joint_step(
-    est: JointEstimate, qdd: F64, q: F64, qd: F64, age: F64, fresh: B1, dt: float, params: JointParams
+    est: JointEstimate, qdd: F64, q: F64, qd: F64, age: F64, replies: I64 | B1, dt: float, params: JointParams
 ) -> tuple[JointEstimate, F64]:
     """Return the joints dt later, corrected by what the drives measured `age` ago, and normalised innovations (n,).
 
     qdd: (n,) [rad/s2] acceleration the model expects, zero when unknown. q, qd: (n,) measured. age: (n,) [s].
-    fresh: (n,) whether this cycle brought a measurement of the joint; the others coast, with innovation 0.
+    replies: (n,) measurements that this cycle brought of each joint; those without coast, with innovation 0.
     """
     noise = (params.sigma_qdd, params.r_q, params.r_qd)
-    *fields, innovation = _joint_step(*est, qdd, q, qd, age, fresh, dt, *noise, params.has_qd)
+    *fields, innovation = _joint_step(*est, qdd, q, qd, age, replies, dt, *noise, params.has_qd)
     return JointEstimate(*fields), innovation
 
 
@@ -239,7 +239,7 @@ def _update_pose(
 
 @njit(cache=True, fastmath=False)
 def _joint_step(
-    q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, fresh: B1, dt: float,
+    q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, replies: I64 | B1, dt: float,
     sigma_qdd: F64, r_q: F64, r_qd: F64, has_qd: bool,
 ) -> tuple[F64, F64, F64, F64]:  # fmt: skip
     n = q.shape[0]
@@ -248,7 +248,7 @@ def _joint_step(
         position = q[i] + dt * (qd[i] + 0.5 * dt * qdd[i])
         speed = qd[i] + dt * qdd[i]
         C = _propagate(P[i], dt, sigma_qdd[i])
-        if fresh[i]:
+        if replies[i] > 0:
             t = age[i]
             y = q_measured[i] - (position - t * speed + 0.5 * t * t * qdd[i])
             S, k0, k1, C = _correct(C, 1.0, -t, r_q[i])

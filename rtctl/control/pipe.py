@@ -108,7 +108,7 @@ def _space(robot: Robot, task: Task, axis: F64, model: Model) -> OperationalSpac
 def _estimated(robot: Robot, m: Memory, feedback: Feedback, elapsed: float) -> Memory:
     """Joint and tip state at this slot, `elapsed` [s] after the previous; the model anew when an evaluation is due."""
     joints, surprise = joint_step(
-        m.joints, m.qdd, feedback.q, feedback.qd, feedback.age, feedback.replies > 0, elapsed, robot.joint_filter
+        m.joints, m.qdd, feedback.q, feedback.qd, feedback.age, feedback.replies, elapsed, robot.joint_filter
     )
     phase = m.phase + robot.dt / robot.model_dt
     target = m.goal if m.goal is not None else m.hold
@@ -216,11 +216,9 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
 
 
 def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
-    enabled = scan.all_equal(feedback.drive, 1)
     if drives_torque(m):
-        if m.state == State.ARMED and not enabled:
-            return Drive.ENABLE
-        return Drive.TORQUE
+        enabled = m.state != State.ARMED or scan.all_equal(feedback.drive, 1)
+        return Drive.TORQUE if enabled else Drive.ENABLE
     if m.tick < m.clear_until and bool((feedback.drive > 1).any()):
         return Drive.CLEAR
     return Drive.DISABLE

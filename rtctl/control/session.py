@@ -93,6 +93,9 @@ def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple
 
 def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:
     """Return the memory after the supervisor's table took this tick's events."""
+    worst = faults.stops(m.in_force)
+    if m.state == State.RUN and request.verb == Verb.NONE and worst < Severity.SS2:
+        return m  # what RUN is left for is asked, or a fault
     m, events = _asked(robot, m, request, present)
     worst = faults.stops(m.in_force)
     if worst >= Severity.SS2:

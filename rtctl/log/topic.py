@@ -62,6 +62,7 @@ class Topic:
         self.dtype = dtype  # of a tick
         self.source = source
         self.channel = channel
+        self._stamps: tuple[I64, I64] | None = None  # log_time and sequence, when the messages have been read
 
     def __len__(self) -> int:
         return len(self.time)
@@ -110,18 +111,20 @@ class Topic:
     @property
     def time(self) -> I64:
         """Return log_time (N,) [ns]."""
+        if self._stamps is not None:
+            return self._stamps[0]
         return self._ticks.times[0] if self.dtype is not None else self._heads[0]
 
     @property
     def sequence(self) -> I64:
         """Return the sequence numbers (N,)."""
+        if self._stamps is not None:
+            return self._stamps[1]
         return self._ticks.times[1] if self.dtype is not None else self._heads[1]
 
     @cached_property
     def _heads(self) -> tuple[I64, I64]:
-        found = self.source(lambda part: (part.time, part.sequence))
-        none = [np.zeros(0, np.int64)]
-        return np.concatenate([f[0] for f in found] or none), np.concatenate([f[1] for f in found] or none)
+        return _stamps(self.source(lambda part: (part.time, part.sequence)))
 
     @cached_property
     def payloads(self) -> list[bytes]:
@@ -140,10 +143,12 @@ class Topic:
         _ = self.fields
         if self.dtype is not None:
             dtype, layout = self.dtype, tick_layout(self.dtype)
-            found = self.source(lambda part: _records(self.name, part, layout, dtype))
-            return stacked(found, dtype)
-        found = self.source(lambda part: _frames(self.name, part))
-        return stacked(found, CAN_ROW)
+            found = self.source(lambda part: (_records(self.name, part, layout, dtype), part.time, part.sequence))
+        else:
+            dtype = CAN_ROW
+            found = self.source(lambda part: (_frames(self.name, part), part.time, part.sequence))
+        self._stamps = _stamps([(times, sequences) for _, times, sequences in found])
+        return stacked([rows for rows, _, _ in found], dtype)
 
     @property
     def json(self) -> list[dict[str, Any]]:
@@ -153,6 +158,11 @@ class Topic:
     @cached_property
     def _ticks(self) -> "_Ticks":
         return _Ticks(self.name, self.dtype if self.dtype is not None else np.dtype([]), self.source)
+
+
+def _stamps(found: Sequence[tuple[I64, I64]]) -> tuple[I64, I64]:
+    none = [np.zeros(0, np.int64)]
+    return np.concatenate([f[0] for f in found] or none), np.concatenate([f[1] for f in found] or none)
 
 
 class _Ticks:
