@@ -1,11 +1,12 @@
 """Which goals are taken, and when one is reached."""
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rtctl.control.goals import Progress, arrived, at_rest, gained, refusal, time_left
+from rtctl.control.goals import Progress, arrived, at_rest, idle, refusal, time_left
 from rtctl.types import Goal, Task
 
 FAR = np.full(3, np.inf)
@@ -76,13 +77,29 @@ def test_what_is_left_is_the_slower_of_way_and_turn():
 
 
 @pytest.mark.parametrize(
-    ("left", "more"),
-    [(2.0, False), (1.95, False), (1.89, True), (2.5, False)],  # in 2 s, of which a twentieth counts
+    ("pace", "until"), [(0.0, 2.0), (0.03, 2.0 / 0.75), (0.06, 4.0), (0.12, math.inf), (0.2, math.inf)]
 )
-def test_who_comes_nearer_at_less_than_a_twentieth_of_full_speed_gains_nothing(left: float, more: bool):
-    assert gained(left, 2.0, 2.0) == more
+def test_who_comes_nearer_more_slowly_than_an_eighth_of_full_speed_is_idle_the_sooner(pace: float, until: float):
+    dt, waited, nearest, left = 0.01, 0.0, 10.0, 10.0
+    for k in range(1, 1000):
+        left -= pace * dt
+        waited, nearest = idle(waited, STUCK, left, nearest, dt, 2.0), min(nearest, left)
+        if waited >= 2.0 - 1e-9:
+            assert k * dt == pytest.approx(until, abs=2 * dt)
+            return
+    assert until == math.inf
 
 
-def test_near_the_goal_half_of_what_is_left_is_a_gain():
-    assert gained(0.009, 0.02, 2.0)
-    assert not gained(0.011, 0.02, 2.0)
+def test_who_moves_fast_or_turns_fast_is_not_idle():
+    assert idle(1.0, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == 0.0
+    assert idle(1.0, STUCK._replace(rate=0.3), 1.0, 1.0, 0.01, 2.0) == 0.0
+    assert idle(1.0, STUCK, 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
+
+
+def test_near_the_goal_half_of_what_is_left_is_enough():
+    assert idle(1.0, STUCK, 0.0199, 0.02, 0.02, 2.0) == pytest.approx(1.0)
+    assert idle(1.0, STUCK, 0.1999, 0.2, 0.02, 2.0) == pytest.approx(1.018)
+
+
+def test_who_turned_back_gains_nothing_until_it_is_nearer_than_ever():
+    assert idle(1.0, STUCK, 0.9, 0.5, 0.01, 2.0) == pytest.approx(1.01)

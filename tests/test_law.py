@@ -266,7 +266,7 @@ def test_nothing_is_pulled_into_what_is_near(pull: float):
         qd = np.array([v, 0.0, 0.0])
         rows, bounds = approach_rows(
             np.zeros(1, np.int64), np.ones(1, np.int64), distances, eye[None], NO_BOUNDS, np.zeros((0, 3)), ZERO, eye,
-            qd, 0.1, 0.02, 5.0, rate,
+            qd, 0.1, 0.02, 0.5, 5.0, rate,
         )  # fmt: skip
         tau, low = np.array([-pull, 0.0, 0.0]), np.full(3, -1e6)
         added, _ = guard(eye, eye, tau, low, -low, rows, bounds)
@@ -315,7 +315,7 @@ def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch(
         push, _, _ = own_field(rho, row, ZERO, qd, eye, field)
         rows, bounds = approach_rows(
             np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 0)), np.zeros((0, 3, 3)), rho, row, ZERO,
-            eye, qd, arm.avoid.rho0, field.rho_min, arm.motion.a_max, np.full(3, 1e3 * step),
+            eye, qd, arm.avoid.rho0, field.rho_min, arm.motion.v_max, arm.motion.a_max, np.full(3, 1e3 * step),
         )  # fmt: skip
         low = np.full(3, -1e6)
         added, _ = guard(eye, eye, push, low, -low, rows, bounds)

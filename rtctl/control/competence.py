@@ -23,6 +23,7 @@ HOLDS = 0.1  # share from which something is said to hold the arm
 LOST = 0.4  # fraction of the wanted acceleration that the tip can have, below which the direction is lost
 EDGE = 0.05  # [m] curvature of the tip's height along a direction that still counts as none: the reach ends there
 AT_BOUND = 1.0 - 1e-6  # of tau_max
+UNKNOWN = "something unknown"  # holds the arm
 
 
 class Balance(NamedTuple):
@@ -167,7 +168,7 @@ def names(robot: Robot, m: Memory, law: Law, found: Held) -> tuple[str, ...]:
         case Status.LOCAL_MINIMUM if not order:
             pair = int(m.model.own_rho.argmin()) if len(m.model.own_rho) else -1
             near = pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0
-            return (" and ".join(robot.own.names[pair]),) if near else ("something unknown",)
+            return (" and ".join(robot.own.names[pair]),) if near else (UNKNOWN,)
         case _:
             return tuple(f"{m.world.names[k]} at {_link(robot, k)}" for k in order)
 

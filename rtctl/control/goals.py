@@ -13,7 +13,7 @@ from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
 
-GAIN = 0.05  # of full speed: who comes nearer more slowly is held by something
+GAIN = 0.12  # of full speed: who comes nearer more slowly is held by something
 
 
 class Progress(NamedTuple):
@@ -69,7 +69,7 @@ def at_rest(p: Progress) -> bool:
 
 def slow(p: Progress) -> bool:
     """Return whether the tip does not get anywhere at this speed."""
-    return p.speed < 4.0 * STILL_SPEED and p.rate < 16.0 * STILL_SPEED
+    return p.speed < 4.0 * STILL_SPEED and p.rate < 25.0 * STILL_SPEED
 
 
 def time_left(p: Progress, v_max: float, w_max: float) -> float:
@@ -77,9 +77,13 @@ def time_left(p: Progress, v_max: float, w_max: float) -> float:
     return max(p.error / v_max, p.error_rot / w_max)
 
 
-def gained(left: float, nearest: float, window: float) -> bool:
-    """Return whether the goal came nearer, from `nearest` to `left` [s] away, as much as counts in `window` [s].
+def idle(before: float, p: Progress, left: float, nearest: float, dt: float, window: float) -> float:
+    """Return for how long [s] the goal has not come nearer, `before` until a tick of dt [s] ago.
 
-    That is GAIN of full speed, or half of what was left: the last of a way is slow.
+    left [s] away now, `nearest` it ever was. At GAIN of full speed the time stands still, faster it falls; half of what
+    was left in a `window` [s] is enough: the last of a way is slow. Who moves fast is not idle.
     """
-    return left < nearest - min(GAIN * window, 0.5 * nearest)
+    if not slow(p):
+        return 0.0
+    pace = min(GAIN, 0.5 * nearest / window)
+    return max(0.0, before + dt - max(0.0, nearest - left) / max(pace, 1e-9))

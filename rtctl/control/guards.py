@@ -24,6 +24,7 @@ JERK_SHARE = 0.5  # of the torque rate counted on: the joints slew as one, the o
 TIP_SLOW = 0.1  # of v_max, below which the tip needs no guard
 NEAR = 0.5  # of the influence, within which a link's approach is guarded; farther out v_max can be given up
 ABREAST = 0.02  # [m]
+OWN_FREE = 0.15  # of v_max, at which a link may come near another of the same arm
 STEPS = 60  # of the search for the least change at most
 SOFT = 1e-4  # by which a bound yields, of the motion its own multiplier makes
 ENOUGH = 1e-6  # [sqrt(W)] that a bound may be passed by, as acceleration times the root of the mass along it
@@ -108,16 +109,17 @@ def tip_row(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64)
 @njit(cache=True, fastmath=False)
 def approach_rows(
     near: I64, link: I64, distances: F64, Jp: F64, own_rho: F64, own_row: F64, dq: F64, A_inv: F64, qd: F64,
-    rho0: float, own_stop: float, braking: float, tau_rate: F64,
+    rho0: float, own_stop: float, v_max: float, braking: float, tau_rate: F64,
 ) -> tuple[F64, F64]:  # fmt: skip
     """Return rows (r, n) along which links come nearer to what they must not touch, and bounds (r,) of row qdd.
 
     near (K,): slots at hand are >= 0; link (m,); distances (K, >= 4, m): rho [m] and normal of every point, of which
     the nearest of a link count and those within ABREAST of it: a link also turns; Jp (>= m, 3, n). own_rho (L,),
-    own_row (L, n), dq: as in `own_field`; every pair that is measured counts, and stops at own_stop [m], where its
-    field has the strength to turn it: that field is thin and steep, and torque that is slewed comes too late for a
-    link that enters it fast. It is the arm's own approach -row qd alone that is bounded, as if with braking [m/s2];
-    what comes towards it is for the field to flee.
+    own_row (L, n), dq: as in `own_field`; every pair that is measured counts, and is slowed before own_stop [m] to what
+    its field turns easily, OWN_FREE of v_max [m/s]: that field is thin and steep, and torque that is slewed comes too
+    late for a link that enters it fast. Slower than that only touching is prevented: a guard as steep as the field
+    would set a folded arm swinging between two pairs. It is the arm's own approach -row qd alone that is bounded, as if
+    with braking [m/s2]; what comes towards it is for the field to flee.
     """
     n = qd.shape[0]
     rows, rooms = np.empty((PAIRS, n)), np.empty(PAIRS)
@@ -139,15 +141,19 @@ def approach_rows(
                         rows[count, i] -= distances[k, 1 + c, j] * Jp[j, c, i]
                 rooms[count] = distances[k, 0, j]
                 count += 1
+    obstacles = count
     for s in range(own_rho.shape[0]):
-        room = own_rho[s] + _dot(own_row[s], dq) if own_rho[s] < np.inf else np.inf
-        if room < np.inf and count < PAIRS:
-            rows[count], rooms[count] = -own_row[s], room - own_stop
+        if own_rho[s] < np.inf and count < PAIRS:
+            rows[count], rooms[count] = -own_row[s], own_rho[s] + _dot(own_row[s], dq)
             count += 1
     bounds = np.empty(count)
     for r in range(count):
-        jerk = jerk_along(rows[r], _dot(rows[r], matvec(A_inv, rows[r])), tau_rate)
-        bounds[r] = may_towards(rooms[r], _dot(rows[r], qd), np.inf, braking, jerk)
+        speed, jerk = _dot(rows[r], qd), jerk_along(rows[r], _dot(rows[r], matvec(A_inv, rows[r])), tau_rate)
+        if r < obstacles:
+            bounds[r] = may_towards(rooms[r], speed, np.inf, braking, jerk)
+        else:
+            fast = may_towards(rooms[r] - own_stop, speed, np.inf, braking, jerk)
+            bounds[r] = max(fast, may_towards(rooms[r], speed, OWN_FREE * v_max, braking, jerk))
     return rows[:count], bounds
 
 

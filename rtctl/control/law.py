@@ -243,7 +243,7 @@ def _evaluate(
     low, high = joint_bounds(model.A, q, qd, q_min, q_max, qd_max, braking, tau_rate)
     near, near_bounds = approach_rows(
         seen.leader, link, seen.pairs, model.Jp, model.own_rho, model.own_row, dq, model.A_inv, qd, avoid.rho0,
-        self_avoid.rho_min, p.a_max, tau_rate,
+        self_avoid.rho_min, p.v_max, p.a_max, tau_rate,
     )  # fmt: skip
     rows, bounds = np.empty((near.shape[0] + 1, q.shape[0])), np.empty(near.shape[0] + 1)
     rows[0], bounds[0] = tip_row(model.J, model.Jdqd, model.A_inv, xd, p.v_max, tau_rate)

@@ -59,8 +59,8 @@ class Memory(msgspec.Struct, frozen=True):
     held: tuple[str, ...]  # the same in words
     escape: Escape
     still: int  # ticks the tip has been at rest
-    nearest: float  # [s] at full speed: the least that the goal was away when it last came nearer
-    stuck: int  # ticks since then
+    nearest: float  # [s] at full speed: the least that the goal was away
+    idle: float  # [s] for which it has not come nearer; see `goals.idle`
     # world and torque
     world: World
     rho: F64  # (K,) [m] from the arm to each obstacle

@@ -95,7 +95,7 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         watch=watch.fresh(robot.n), rest=0,
         goal=None, hold=hold_at(model.x, model.R, robot.axes), holders=0, held=(), escape=Escape(), tau_obstacles=zero,
         q_rest=q, v_ref=ZERO, w_ref=ZERO, goal_rho=far, status=Status.NO_GOAL, blocker=-1, still=0,
-        nearest=np.inf, stuck=0, world=table,
+        nearest=np.inf, idle=0.0, world=table,
         rho=far, sent=np.zeros((4, robot.n)), cut=0, pulled=False, pace=START_PACE,
     )  # fmt: skip
 
@@ -234,31 +234,36 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progr
     if m.escape.active or m.escape.phase == escape.Phase.CHOOSING:
         return m._replace(status=Status.ESCAPING, still=0)  # held by what it circulates
     still = m.still + 1 if goals.at_rest(p) else 0
-    m, stall = _approached(robot, m, p)._replace(still=still), round(robot.stop.stall / robot.dt)
+    stall, waited = round(robot.stop.stall / robot.dt), _waited(robot, m)
+    m = _approached(robot, m, p)._replace(still=still)
     circles = robot.escape and m.escape.phase == escape.Phase.NONE
     if circles and still == round(escape.STALL / robot.dt):
         return _caught(robot, m, law, permitted, goal, p.error)
-    idle = max(still, m.stuck if goals.slow(p) else 0)
-    if idle < stall:
+    if not _waited(robot, m):
         return _with_status(m, Status.MOVING)
-    if (idle - stall) % round(REVIEW / robot.dt):
+    if waited and m.tick % round(REVIEW / robot.dt):
         return m
     if circles and still < stall:  # it creeps
         begun = _caught(robot, m, law, permitted, goal, p.error)
         if begun.status == Status.ESCAPING:
             return begun
     found = competence.held(competence.balance(robot, m, law, permitted.tau_wanted))
-    if still < stall and found.status == Status.LOCAL_MINIMUM and not found.mask:
+    told = _with_held(robot, m, law, found)._replace(status=found.status)
+    if still < stall and told.held == (competence.UNKNOWN,):
         return _with_status(m, Status.MOVING)  # slow, and nothing is in its way
-    return _with_held(robot, m, law, found)._replace(status=found.status)
+    return told
+
+
+def _waited(robot: Robot, m: Memory) -> bool:
+    """Return whether the arm has been at rest, or got no nearer to its goal, for long enough to ask what holds it."""
+    return max(m.still * robot.dt, m.idle) >= robot.stop.stall - 0.5 * robot.dt
 
 
 def _approached(robot: Robot, m: Memory, p: Progress) -> Memory:
-    """Return the memory with how near the goal has been, and since when it has not come nearer."""
+    """Return the memory with how near the goal has been, and for how long it has not come nearer."""
     left = goals.time_left(p, robot.motion.v_max, robot.motion.w_max)
-    if goals.gained(left, m.nearest, robot.stop.stall):
-        return m._replace(nearest=left, stuck=0)
-    return m._replace(stuck=m.stuck + 1)
+    idle = goals.idle(m.idle, p, left, m.nearest, robot.dt, robot.stop.stall)
+    return m._replace(nearest=min(left, m.nearest), idle=idle)
 
 
 def _with_status(m: Memory, status: Status) -> Memory:

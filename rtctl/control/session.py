@@ -204,7 +204,7 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
 def free_of_goals(m: Memory) -> Memory:
     """Return the memory without a goal and what was known of it."""
     return m._replace(
-        goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, nearest=np.inf, stuck=0,
+        goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, nearest=np.inf, idle=0.0,
         escape=Escape(),
     )  # fmt: skip
 
