@@ -81,9 +81,10 @@ def idle(before: float, p: Progress, left: float, nearest: float, dt: float, win
     """Return for how long [s] the goal has not come nearer, `before` until a tick of dt [s] ago.
 
     left [s] away now, `nearest` it ever was. At GAIN of full speed the time stands still, faster it falls; half of what
-    was left in a `window` [s] is enough: the last of a way is slow. Who moves fast is not idle.
+    was left in a `window` [s] is enough: the last of a way is slow. It also falls while the tip moves fast, twice as
+    quickly as it grew: who trembles is idle all the same.
     """
     if not slow(p):
-        return 0.0
+        return max(0.0, before - 2.0 * dt)
     pace = min(GAIN, 0.5 * nearest / window)
     return max(0.0, before + dt - max(0.0, nearest - left) / max(pace, 1e-9))

@@ -250,7 +250,7 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progr
     found = competence.held(competence.balance(robot, m, law, permitted.tau_wanted))
     told = _with_held(robot, m, law, found)._replace(status=found.status)
     if still < stall and told.held == (competence.UNKNOWN,):
-        return _with_status(m, Status.MOVING)  # slow, and nothing is in its way
+        return m if waited else _with_status(m, Status.MOVING)  # slow, and nothing new is in its way
     return told
 
 
