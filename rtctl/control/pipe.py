@@ -238,7 +238,10 @@ def _diagnosed(robot: Robot, m: Memory, law: Law, permitted: Permitted, p: Progr
     m = _approached(robot, m, p)._replace(still=still)
     circles = robot.escape and m.escape.phase == escape.Phase.NONE
     if circles and still == round(escape.STALL / robot.dt):
-        return _caught(robot, m, law, permitted, goal, p.error)
+        begun = _caught(robot, m, law, permitted, goal, p.error)
+        if begun.status == Status.ESCAPING or not waited:
+            return begun
+        m = m._replace(escape=begun.escape)
     if not _waited(robot, m):
         return _with_status(m, Status.MOVING)
     if waited and m.tick % round(REVIEW / robot.dt):

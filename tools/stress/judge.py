@@ -23,7 +23,7 @@ REST = 0.012  # [m/s] mean speed of a tip at rest
 CREEP = 0.03  # [m/s] mean speed of a tip that creeps at most
 CREEP_TURN = 0.2  # [rad/s] mean rate of one that does not turn to speak of either
 SLOW = 0.04  # of full speed: who comes nearer more slowly does not move towards the goal
-LATE = 0.7  # [s] by which a diagnosis may come later than the stall that it tells
+LATE = 1.5  # [s] by which a diagnosis may come later than the stall it tells: an arm trembles, or still gains a little
 SINGULAR = 2.0  # times the threshold of damping: the state of now, not of the moment of the diagnosis
 
 
