@@ -1,5 +1,6 @@
 """The recorder process: nothing that was put is lost, whoever is killed; nothing it meets stops the producer."""
 
+import fcntl
 import json
 import os
 import resource
@@ -7,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -218,6 +220,28 @@ def test_when_both_are_killed_the_next_start_rescues_what_was_put(tmp_path: Path
     assert frames == list(range(1, len(frames) + 1))
     assert sentinels[-1]["reason"] == "producer died"
     assert rescue(tmp_path / "log", [tmp_path]) == []
+
+
+def held(*paths: Path) -> list[int]:
+    """Lock files as a process does that was killed and has not ended yet; closing them lets go."""
+    files = [os.open(path, os.O_RDWR) for path in paths]
+    for file in files:
+        fcntl.flock(file, fcntl.LOCK_EX)
+    return files
+
+
+def test_a_rescue_waits_for_one_that_is_dying_and_leaves_what_one_that_lives_has(tmp_path: Path) -> None:
+    _, put = killed(tmp_path, 150, both=True)
+    ring, left = *tmp_path.glob("*.ring"), *(tmp_path / "log").glob("*.open")
+    files = held(ring, left)
+    assert rescue(tmp_path / "log", [tmp_path]) == []
+    assert ring.exists()
+    assert left.exists()
+    for file in files:
+        threading.Timer(0.2, os.close, (file,)).start()
+    assert rescue(tmp_path / "log", [tmp_path])
+    assert not ring.exists()
+    assert len(logged(tmp_path / "log")[0]) >= put
 
 
 def test_a_new_recorder_rescues_the_logs_of_its_folder(start: Start, tmp_path: Path) -> None:

@@ -126,9 +126,7 @@ def trial(folder: Path, victim: str, after: float, rng: random.Random) -> Trial:
         os.kill(child, signal.SIGTERM)
     os.waitpid(child, 0)
     if victim == "both":
-        until = time.monotonic() + 5.0  # nobody waits for the recorder: its threads keep the ring's lock till they end
-        while Path(ring_path).exists() and time.monotonic() < until:
-            rescue(folder / "log", [folder])
+        rescue(folder / "log", [folder])
     else:
         _wait_gone(Path(ring_path))
     committed = ring.words[rings.NUMBER] - (ring.words[rings.CLOSED] == 1)

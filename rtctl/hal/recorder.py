@@ -7,7 +7,6 @@ far that one came, and goes on behind it.
 """
 
 import contextlib
-import fcntl
 import json
 import os
 import select
@@ -29,7 +28,7 @@ from rtctl.log.entry import Batch, Kind
 from rtctl.log.header import Header, header_from_json, header_to_json
 from rtctl.log.reader import read, segments
 from rtctl.log.recover import recover, recover_folder
-from rtctl.log.segment import CHUNK_BYTES, OPEN
+from rtctl.log.segment import CHUNK_BYTES, OPEN, locked
 from rtctl.log.writer import Options, Session, segment_path
 
 CAPACITY = 32 << 20  # [bytes]: some 8 s of a 7-joint arm at 1 kHz
@@ -287,9 +286,7 @@ def drain(path: Path) -> bool:
     Raises LinkError when the file is not a ring, OSError when it cannot be opened.
     """
     ring = attach(path)
-    try:
-        fcntl.flock(ring.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    if not locked(ring.file):
         ring.unmap()
         return False
     ring.words[rings.CONSUMER], ring.words[rings.CONSUMER_START] = os.getpid(), rings.process_start(os.getpid())

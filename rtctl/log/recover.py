@@ -1,6 +1,5 @@
 """Making a file whole that was cut off: keep every whole chunk, write the end that its writer could not."""
 
-import fcntl
 import json
 import os
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.catalog import attachment, parsed
 from rtctl.log.rows import Encoded, message
-from rtctl.log.segment import OPEN, Segment, settle
+from rtctl.log.segment import OPEN, Segment, locked, settle
 from rtctl.log.summary import END, Summary, message_indices
 from rtctl.log.walk import (
     MESSAGE,
@@ -61,11 +60,9 @@ def recover(path: Path, content: Mapping[str, Any] | None = None) -> Recovery:
         raise LogError(f"{path}: wanted a file ending in {OPEN}")
     target = path.with_name(path.name.removesuffix(OPEN))
     file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    if not locked(file):
         os.close(file)
-        raise LogError(f"{path}: is being written") from None
+        raise LogError(f"{path}: is being written")
     data = path.read_bytes()
     if not has_magic(data, len(data))[0]:
         target = path.with_name(target.name + BAD)

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import struct
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from rtctl.log.summary import MAGIC, Summary, message_indices, packed
 
 OPEN = ".open"  # suffix while a file is being written
 CHUNK_BYTES = 256 << 10
+LETTING_GO = 0.5  # [s] for which a lock may outlive the process it was of
 LEVEL = 1  # on such rows smaller and faster than 3
 INFO = "rtctl"  # the metadata record with the header
 MEDIA = {".urdf": "application/xml", ".zip": "application/zip", ".json": "application/json"}  # of attachments
@@ -125,10 +127,26 @@ def open_name(path: Path) -> Path:
     return path.with_name(path.name + OPEN)
 
 
-def begin(path: Path, header: Header, channels: tuple[Channel, ...], time: int, more: Mapping[str, str]) -> Segment:
+def locked(file: int) -> bool:
+    """Take the lock of an open file; False when another still has it after LETTING_GO.
+
+    A process that was killed a moment ago has it until its threads have ended: who comes to its rescue waits that long.
+    """
+    until = time.monotonic() + LETTING_GO
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except OSError:
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.01)
+
+
+def begin(path: Path, header: Header, channels: tuple[Channel, ...], stamp: int, more: Mapping[str, str]) -> Segment:
     """Open a new file and write what comes before the first message.
 
-    time: log_time [ns] of the attachments; more: further metadata (clock offset, segment number).
+    stamp: log_time [ns] of the attachments; more: further metadata (clock offset, segment number).
     Raises OSError.
     """
     file = os.open(open_name(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
@@ -136,7 +154,7 @@ def begin(path: Path, header: Header, channels: tuple[Channel, ...], time: int, 
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         segment = Segment(path, file, summary, 0)
-        segment.write(_start(summary, header, channels, time, more))
+        segment.write(_start(summary, header, channels, stamp, more))
     except OSError:
         os.close(file)
         open_name(path).unlink(missing_ok=True)
