@@ -11,6 +11,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -131,8 +133,7 @@ def _arm(run: Run, config: Path | None) -> _Subject:
     what, robot = rebuilt(run) if config is None else other(config, run)
     link = CanLink(link_spec(what), cast(Transport, _Null()))
     memory = initial(robot, first_feedback(_first_q(run)))
-    step = lambda m, feedback, request: tick(robot, m, feedback, request)  # noqa: E731
-    return _Subject(robot.name, robot.dt, memory, step, feedbacks_of, link, "tau_sent", robot)
+    return _Subject(robot.name, robot.dt, memory, partial(tick, robot), feedbacks_of, link, "tau_sent", robot)
 
 
 def _base(run: Run, config: Path | None) -> _Subject:
@@ -153,8 +154,7 @@ def _base(run: Run, config: Path | None) -> _Subject:
         raise LogError(f"{run.path}: its header has no feedback of the handshake") from None
     if abs(base.dt - header.period) > 1e-12:
         raise ConfigError(f"{path}: loop.servo_hz", f"{1.0 / base.dt:g}", f"the log's {1.0 / header.period:g}")
-    step = lambda m, feedback, request: pipe.tick(base, m, feedback, request)  # noqa: E731
-    rows = lambda records: map(feedback_from, records)  # noqa: E731
+    step, rows = partial(pipe.tick, base), partial(map, feedback_from)
     return _Subject(base.name, base.dt, pipe.initial(base, start), step, rows, None, "v_world")
 
 
@@ -198,12 +198,14 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     if not whole and not marks:
         raise LogError(f"{run.path}: begins with tick {first.record['tick']}; what was before it is missing")
     gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
-    done = _at_once(run, subject, marks, whole, progress) if marks and config is None else None
     digest = hashlib.sha256()
-    if done is None:
-        span = EVERYTHING if whole else (marks[0].time + 1, I64_MAX)
-        done = [_played(run, subject, span, None if whole else marks[0], config is None, digest.update, progress)]
-    gc.unfreeze()
+    try:
+        done = _at_once(run, subject, marks, whole, progress) if marks and config is None else None
+        if done is None:
+            span, begin = (EVERYTHING, None) if whole else ((marks[0].time + 1, I64_MAX), marks[0])
+            done = [_played(run, subject, span, begin, config is None, digest.update, progress)]
+    finally:
+        gc.unfreeze()
     for part in done:
         digest.update(part.sent)
     seconds, ticks = time.perf_counter() - begun, sum(part.ticks for part in done)
@@ -237,7 +239,10 @@ def _at_once(
         waiting = [pool.submit(_span, k) for k in range(len(starts))]
         parts = []
         for each in waiting:
-            part = each.result()
+            try:
+                part = each.result()
+            except BrokenProcessPool:  # a process died: in order, it is seen where
+                return None
             if part is None or part.divergence is not None or part.differences or not part.agrees:
                 pool.shutdown(cancel_futures=True)
                 return None

@@ -12,7 +12,6 @@ from rtctl.control.task import selected, task_error
 from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
-
 GAIN = 0.12  # of full speed: who comes nearer more slowly is held by something
 
 

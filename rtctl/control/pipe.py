@@ -71,11 +71,11 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     m = supervised(robot, m, feedback, request, present)
     m = with_goal(robot, m, request)
     m, law = _law(robot, m)
-    m, command, permitted, out = _commanded(robot, m, feedback, law)
+    m, command, permitted = _commanded(robot, m, feedback, law)
     pursued = m.goal if m.goal is not None and m.state == State.RUN else m.hold
     p = goals.progress(pursued, m.tip)
     m = _diagnosed(robot, m, law, permitted, p)
-    return m, command, _record(robot, m, feedback, request.verb, law, p, out, command.drive)
+    return m, command, _record(robot, m, feedback, request.verb, law, p, permitted, command)
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
@@ -195,8 +195,8 @@ def _pace(robot: Robot, m: Memory) -> float:
     return START_PACE if m.state == State.ARMED or m.recovering else min(1.0, m.pace + robot.dt / START_TIME)
 
 
-def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[Memory, Command, Permitted, F64]:
-    """Turn the law's torque into what the drives are asked for, through the permitter; also wanted and sent (2, n)."""
+def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[Memory, Command, Permitted]:
+    """Turn the law's torque into what the drives are asked for, through the permitter."""
     drive, keep = law.drive, law.keep
     if m.state == State.SAFE_STOP and m.reaction >= Severity.SS1:  # damp -D qd + g, then torque off
         over = (m.tick - m.since) * robot.dt >= robot.stop.time or m.rest * robot.dt >= REST_HOLD
@@ -212,7 +212,7 @@ def _commanded(robot: Robot, m: Memory, feedback: Feedback, law: Law) -> tuple[M
     sent = rows[1:5]
     permitted = Permitted(rows[0], sent[0], cut, scale)
     m = m._replace(sent=sent, qdd=rows[5], cut=cut | law.cut, pulled=off)
-    return m, Command(asked, sent[0]), permitted, rows[:2]
+    return m, Command(asked, sent[0]), permitted
 
 
 def _asked_of_drives(m: Memory, feedback: Feedback) -> Drive:
@@ -290,16 +290,17 @@ def _caught(robot: Robot, m: Memory, law: Law, permitted: Permitted, goal: Goal,
 
 
 def _record(
-    robot: Robot, m: Memory, feedback: Feedback, verb: Verb, law: Law, p: Progress, out: F64, drive: Drive
+    robot: Robot, m: Memory, feedback: Feedback, verb: Verb, law: Law, p: Progress, permitted: Permitted, out: Command
 ) -> Record:
-    """Write everything that came in and went out into one struct; out: (2, n) [Nm] wanted and sent."""
+    """Write everything that came in and went out into one struct."""
     goal = m.goal if m.goal is not None else m.hold
     return make_record(
         robot.n, robot.slots, m.tick, feedback.slot * robot.dt, feedback, verb, m.tip, m.innovation, goal, law.F,
         (p.error, p.error_rot, m.space.sigma_min), law.seen, law.nearest,
-        law.torques[: LOAD + 1], out,
+        law.torques[: LOAD + 1], permitted.tau_wanted, out.tau,
         Tail(
-            drive, m.cut, m.state, m.status, m.blocker, m.holders, m.escape.phase, m.reaction, m.in_force, m.evaluated
+            out.drive, m.cut, m.state, m.status, m.blocker, m.holders, m.escape.phase, m.reaction, m.in_force,
+            m.evaluated,
         ),
     )  # fmt: skip
 

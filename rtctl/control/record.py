@@ -101,12 +101,13 @@ class Tail(NamedTuple):
 
 def make_record(
     n: int, slots: int, tick: int, time: float, feedback: Feedback, verb: int, tip: TipEstimate, innovation: float,
-    goal: Goal, F: F64, errors: tuple[float, float, float], seen: F64, nearest: I32, parts: F64, out: F64, tail: Tail,
+    goal: Goal, F: F64, errors: tuple[float, float, float], seen: F64, nearest: I32, parts: F64, wanted: F64, sent: F64,
+    tail: Tail,
 ) -> Record:  # fmt: skip
     """Return the record of one tick, read-only. All arrays are C-contiguous.
 
     errors: error [m], error_rot [rad], sigma_min [1/kg]. seen: (4 slots,) rho [m], then force (slots, 3) [N].
-    parts: (5, n) [Nm] from tau_motion to tau_gravity; out: (2, n) [Nm] tau_wanted and tau_sent.
+    parts: (5, n) [Nm] from tau_motion to tau_gravity; wanted, sent: (n,) [Nm].
     Assigning to the fields one by one takes numpy ten times as long as joining their bytes.
     """
     f = feedback
@@ -116,7 +117,7 @@ def make_record(
         _ASKED.pack(verb, f.lateness, f.compute),
         tip.x.tobytes(), tip.xd.tobytes(), quat_of(tip.R).tobytes(), tip.omega.tobytes(), _F64.pack(innovation),
         goal.position.tobytes(), goal.wxyz.tobytes(), goal.axis.tobytes(), _TASK.pack(goal.task), F.tobytes(),
-        _ERRORS.pack(*errors), seen.tobytes(), nearest.tobytes(), parts.tobytes(), out.tobytes(),
-        _TAIL.pack(*tail),
+        _ERRORS.pack(*errors), seen.tobytes(), nearest.tobytes(), parts.tobytes(), wanted.tobytes(),
+        sent.tobytes(), _TAIL.pack(*tail),
     ))  # fmt: skip
     return np.frombuffer(raw, record_dtype(n, slots))
