@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from msgspec.structs import astuple
 from numpy.typing import NDArray
 
@@ -24,7 +25,7 @@ from rtctl.hal.can import CanLink
 from rtctl.hal.clock import Slot
 from rtctl.hal.transport import InProcess
 from rtctl.servo import Servo, Turn, first_feedback
-from rtctl.sim import Feed, Tally
+from rtctl.sim import Feed, Tally, simulate
 from rtctl.types import (
     F64,
     Command,
@@ -309,3 +310,12 @@ def leaves(value: Any, visit: Callable[[NDArray[Any]], None]) -> None:
     elif isinstance(value, tuple | list):
         for each in value:
             leaves(each, visit)
+
+
+def recorded(folder: Path, scene: str) -> dict[str, Any]:
+    """Play a scene of the Panda, given as TOML, into folder/run.mcap; return its figures. The robot is built once."""
+    (folder / "scene.toml").write_text(scene)
+    arm = robot()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cfg, "build", lambda config, path: arm)
+        return simulate(folder / "scene.toml", log=folder / "run.mcap")

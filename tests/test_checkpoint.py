@@ -19,10 +19,9 @@ from rtctl.log import checkpoint
 from rtctl.log.checkpoint import decode_checkpoint, encode_checkpoint
 from rtctl.log.run import read_run
 from rtctl.replay import Replay, replay
-from rtctl.sim import simulate
 from rtctl.types import Goal, ObstacleEdit, Request, Shape, State, Task
 from tests.arms import PANDA_HOME
-from tests.lab import PANDA, ROOT, Standing, at_rest, goal, healthy, robot, same, seen, sphere
+from tests.lab import PANDA, ROOT, Standing, at_rest, goal, healthy, recorded, robot, same, seen, sphere
 
 PLANAR4 = ROOT / "configs" / "planar4.toml"
 SCENE = f"""
@@ -61,12 +60,9 @@ def busy() -> Memory:
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in several files, with a checkpoint every SPAN."""
     folder = tmp_path_factory.mktemp("checkpoints")
-    (folder / "scene.toml").write_text(SCENE)
-    arm = robot()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(checkpoint, "PERIOD", SPAN)
-        patch.setattr(cfg, "build", lambda config, path: arm)
-        simulate(folder / "scene.toml", log=folder / "run.mcap")
+        recorded(folder, SCENE)
     return folder / "run.mcap"
 
 

@@ -35,7 +35,7 @@ from rtctl.log.segment import begin
 from rtctl.replay import rebuilt, replay
 from rtctl.sim import simulate
 from tests.arms import panda
-from tests.lab import PANDA, ROOT, robot
+from tests.lab import PANDA, ROOT, recorded, robot
 from tools import crash, golden
 
 SCENE = f"""
@@ -58,12 +58,7 @@ velocity_m_s = [0.0, -0.1, 0.0]
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `rtctl sim` with everything in it."""
     folder = tmp_path_factory.mktemp("log")
-    (folder / "scene.toml").write_text(SCENE)
-    arm = robot()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cfg, "build", lambda config, path: arm)
-        figures = simulate(folder / "scene.toml", log=folder / "run.mcap")
-    (folder / "digest").write_text(figures["digest"])
+    (folder / "digest").write_text(recorded(folder, SCENE)["digest"])
     return folder / "run.mcap"
 
 
