@@ -90,10 +90,14 @@ def test_who_comes_nearer_more_slowly_than_an_eighth_of_full_speed_is_idle_the_s
     assert until == math.inf
 
 
-def test_who_moves_fast_or_turns_fast_is_less_and_less_idle():
+def test_who_moves_fast_is_less_and_less_idle():
     assert idle(1.0, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == pytest.approx(0.98)
-    assert idle(1.0, STUCK._replace(rate=0.3), 1.0, 1.0, 0.01, 2.0) == pytest.approx(0.98)
-    assert idle(0.01, STUCK._replace(rate=0.3), 1.0, 1.0, 0.01, 2.0) == 0.0
+    assert idle(0.01, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == 0.0
+
+
+def test_who_turns_on_the_spot_is_idle_unless_it_turns_to_its_goal():
+    assert idle(1.0, STUCK._replace(rate=0.6), 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
+    assert idle(1.0, STUCK._replace(rate=0.6), 0.99, 1.0, 0.01, 2.0) < 0.95
     assert idle(1.0, STUCK, 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
 
 

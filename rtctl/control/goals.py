@@ -67,8 +67,8 @@ def at_rest(p: Progress) -> bool:
 
 
 def slow(p: Progress) -> bool:
-    """Return whether the tip does not get anywhere at this speed."""
-    return p.speed < 4.0 * STILL_SPEED and p.rate < 25.0 * STILL_SPEED
+    """Return whether the tip goes nowhere at this speed. How fast it turns says nothing: to the goal is what counts."""
+    return p.speed < 4.0 * STILL_SPEED
 
 
 def time_left(p: Progress, v_max: float, w_max: float) -> float:

@@ -21,9 +21,8 @@ TIP_TOLERANCE = 0.02  # of v_max
 OVERHANG = 0.03  # [m] farthest that the spheres which the controller knows reach beyond the links
 REST = 0.012  # [m/s] mean speed of a tip at rest
 CREEP = 0.03  # [m/s] mean speed of a tip that creeps at most
-CREEP_TURN = 0.2  # [rad/s] mean rate of one that does not turn to speak of either
 SLOW = 0.04  # of full speed: who comes nearer more slowly does not move towards the goal
-LATE = 1.5  # [s] by which a diagnosis may come later than the stall it tells: an arm trembles, or still gains a little
+LATE = 0.7  # [s] by which a diagnosis may come later than the stall that it tells
 SINGULAR = 2.0  # times the threshold of damping: the state of now, not of the moment of the diagnosis
 
 
@@ -93,10 +92,6 @@ def _creeps(servo: Servo, watch: "Watch") -> bool:
     assert m.goal is not None
     rows = range(len(watch.path_of) - round((robot.stop.stall + LATE) / robot.dt), len(watch.path_of), 20)
     if rows.start < 0 or _speed(watch.path_of[rows.start :], robot.dt) > CREEP:
-        return False
-    turns = np.array(watch.turn_of[rows.start :: 20])
-    halves = np.arccos(np.minimum(1.0, np.abs((turns[1:] * turns[:-1]).sum(axis=1))))
-    if 2.0 * halves.mean() / (20 * robot.dt) > CREEP_TURN:
         return False
     left = []
     for k in rows:
