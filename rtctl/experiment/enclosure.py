@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, axis_view
 from rtctl.experiment.scene import Say, Trace, unsaid
-from rtctl.experiment.style import BLUE, FRONT, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
+from rtctl.experiment.style import BLUE, FRONT, INK, ORANGE, PAPER, RED, Axes, level, note, page, thinned
 from rtctl.experiment.tour import arrivals, leg, numbers, tour
 
 TITLE = "A planar arm of four joints in an enclosure"
@@ -98,7 +98,7 @@ def _clearance(axes: Axes, data: Data) -> None:
     level(axes, 1e3 * avoid.rho0, "influence", BLUE)
     arrivals(axes, trace, 6.0)
     for k, goal in enumerate(trace.scenario.goal):
-        axes.text(goal.at_s + 0.06, 134, f"goal {k + 1}", fontsize=12, color=INK, va="top")
+        note(axes, goal.at_s + 0.06, 134, f"goal {k + 1}", va="top")
     axes.set_ylim(0.0, 140.0)
     axes.set_xlim(0.0, trace.time[-1])
     axes.set_xlabel("time [s]")
