@@ -167,9 +167,15 @@ def test_limits_of_the_wheels_hold_whatever_is_asked():
         assert abs(w) <= BASE.limits.w_max
         v, w = law.unicycle(car, v_ref, yaw)
         assert abs(w) * 2.0 <= abs(v) + 1e-9
-    v, w = law.unicycle(BASE, np.array([-1.0, 0.0]), 0.0)  # straight behind: it must turn, not wait
-    assert v == 0.0
-    assert abs(w) == BASE.limits.w_max
+
+
+@pytest.mark.parametrize("speed", [2.0, 1.0, 0.3, 0.01, 1e-5])
+def test_what_is_behind_is_turned_to_on_the_spot_no_faster_than_the_reference_moves(speed: float):
+    for angle in np.linspace(0.51 * math.pi, 1.49 * math.pi, 25):  # straight behind among them: it must turn, not wait
+        v, w = law.unicycle(BASE, speed * np.array([math.cos(angle), math.sin(angle)]), 0.0)
+        assert v == 0.0
+        assert abs(w) == pytest.approx(min(BASE.limits.w_max, speed / BASE.ahead))
+        assert w * math.sin(angle) >= -1e-12  # the short way round
 
 
 def test_v_ref_stays_under_v_max_and_a_max_when_the_goal_jumps():

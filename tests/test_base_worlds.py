@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rtctl.sim import simulate
-from rtctl.types import ObstacleEdit, Shape, State, Status
+from rtctl.types import ObstacleEdit, Shape, State, Status, Verb
 from tests.base_lab import CONFIGS, ROVER, ROVER_PX4, UPRIGHT, BaseLab, Relay, some_world
 
 # time to goal [s] that an autopilot's own avoidance needed in the same world (ArduPilot BendyRuler at 2 m/s)
@@ -27,6 +27,20 @@ def test_four_worlds_with_half_a_metre_to_spare_and_no_slower_than_the_autopilot
     assert found["min_clearance_m"]["all"] >= 0.5
     assert found["contacts"] == 0
     assert found["faults"] == []
+
+
+@pytest.mark.parametrize("verb", [Verb.NONE, Verb.DISARM, Verb.TERM])
+@pytest.mark.parametrize("goal", [(12.0, 0.5), (4.0, 6.0), (-5.0, 2.0)])
+def test_who_has_arrived_does_not_turn_on_the_spot(goal: tuple[float, float], verb: Verb):
+    lab = BaseLab().armed()
+    assert lab.arrive(*goal)
+    yaw, swing = lab.rover.truth().yaw, 0.0
+    lab.tick(verb)
+    for _ in range(200):
+        lab.tick()
+        swing = max(swing, abs(lab.rover.truth().yaw - yaw))
+    assert lab.speed < 0.01
+    assert swing < 0.05
 
 
 def test_twenty_random_goals_among_ten_random_solids_without_contact():

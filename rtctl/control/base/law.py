@@ -188,8 +188,8 @@ def unicycle(base: Base, v_ref: F64, yaw: float) -> tuple[float, float]:
     if speed < 1e-6:
         return 0.0, 0.0
     w = aside / base.ahead
-    if ahead < 0.0 and not lim.reverse:  # behind: turn towards it, as fast as may be
-        w, ahead = math.copysign(lim.w_max, aside), 0.0
+    if ahead < 0.0 and not lim.reverse:  # behind: turn towards it on the spot, as though it were abreast
+        w, ahead = math.copysign(speed, aside) / base.ahead, 0.0
     if lim.radius > 0.0:  # a car turns only while it rolls
         if abs(ahead) < CREEP and abs(w) * lim.radius > abs(ahead):
             ahead = math.copysign(min(CREEP, speed), ahead)
