@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from rtctl.config import Config, scales
@@ -14,7 +13,7 @@ from rtctl.control.so3 import R_of, quat_of
 from rtctl.hal.can import JointSpec, LinkSpec
 from rtctl.log.dbc import DBC, dbc_of
 from rtctl.log.dbc import Joint as DbcJoint
-from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files
+from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files, scene_text
 from rtctl.log.mesh import MESHES, archive
 from rtctl.protocol import mit
 from rtctl.types import F64
@@ -75,14 +74,9 @@ def scene_of(config: Config, robot: Robot) -> str:
     """Return as JSON what the recorder needs to draw the arm and its obstacles without knowing the robot."""
     base = config.robot.base_pose
     wxyz = quat_of(R_of(quaternion(base.rpy_rad, base.wxyz)))
-    points = [[int(link), *p] for link, p in zip(robot.points.link, robot.points.local.tolist(), strict=True)]
-    shapes = [
-        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in robot.obstacles
-    ]
-    scene = {
-        "base": {"position": list(base.position_m), "wxyz": wxyz.tolist()},
-        "tip_frame": config.robot.tip_frame,
-        "points": points,
-        "obstacles": shapes,
-    }
-    return msgspec.json.encode(scene).decode()  # which takes the bytes of a cloud, too
+    at = zip(robot.points.link, robot.points.local.tolist(), robot.points.radius.tolist(), strict=True)
+    return scene_text(
+        [[int(link), *p, radius] for link, p, radius in at],
+        robot.obstacles,
+        base={"position": list(base.position_m), "wxyz": wxyz.tolist()},
+    )

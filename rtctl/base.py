@@ -21,7 +21,7 @@ from rtctl.hal.mavlink_keys import Keys
 from rtctl.hal.messages import Bounds
 from rtctl.hal.wire import Wire, open_wire
 from rtctl.log.entry import Kind
-from rtctl.log.header import Header, make_header
+from rtctl.log.header import SCENE_FILE, Header, make_header, scene_text
 from rtctl.servo import Machine, Servo, Sink
 from rtctl.types import State, Status, Task
 
@@ -106,6 +106,7 @@ def header_of(config: BaseConfig, path: Path, base: Base, start: BaseFeedback, *
     header = make_header(
         base.name, (), base.slots, base.dt, config=path.read_text(encoding="utf-8"), buses=(),
         extra={"pose_handshake": pose.tobytes().hex(), "kind": "base", "start": first, **extra},
+        files={SCENE_FILE: scene_text(np.column_stack([base.points, base.point_radius]).tolist(), base.obstacles)},
     )  # fmt: skip
     return header._replace(dtype=base_dtype(base.slots), links=(LINK,))
 

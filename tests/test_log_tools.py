@@ -532,15 +532,3 @@ def test_the_example_script_runs(log: Path, capsys: pytest.CaptureFixture[str]):
     said = capsys.readouterr().out
     assert "[rad] joint positions" in said
     assert "14 identifiers" in said
-
-
-def test_the_layouts_for_viewers_show_fields_that_logs_have():
-    fields = set(FIELDS)
-    foxglove = (ROOT / "configs" / "foxglove.json").read_text()
-    plotjuggler = (ROOT / "configs" / "plotjuggler.xml").read_text()
-    json.loads(foxglove)
-    used = set(re.findall(r"/tick\.(\w+)", foxglove)) | set(re.findall(r"/tick/(\w+)", plotjuggler))
-    assert len(used) > 8
-    assert used <= fields
-    for topic in ("/scene", "/tf", "/joint_states", "/log"):
-        assert topic in foxglove

@@ -65,8 +65,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     console.print(_table(runs))
     plot = out / "rover.png"
     draw(runs, plot)
-    console.print(f"plot  {plot}\nlogs  {', '.join(str(run.log) for run in runs)}\ntlogs {out}/*.tlog")
+    console.print("its: the autopilot's own avoidance in the same world\n", style="dim")
+    for name, files in (("plot", [plot]), ("log", [run.log for run in runs]), ("tlogs", [out / "*.tlog"])):
+        for file in files:
+            console.print(f"{name:6}{file}", soft_wrap=True, highlight=False)
     fine = all(run.time is not None and not run.contacts and not run.faults for run in runs)
+    reached, contacts = sum(run.time is not None for run in runs), sum(run.contacts for run in runs)
+    verdict = f"{'PASS' if fine else 'FAIL'}  {reached} of {len(runs)} goals reached, {contacts} contacts"
+    console.print(f"\n{verdict}", style="bold green" if fine else "bold red", highlight=False)
     return EXIT_OK if fine else EXIT_FAILED
 
 
@@ -166,8 +172,9 @@ def _drive(session: Session, scenario: Scenario, console: Console) -> float | No
 
 
 def _table(runs: Sequence[Run]) -> Table:
-    table = Table(title="goal reached, and the least distance between hull and obstacle", title_justify="left")
-    for name in ("world", "time", "clearance", "contacts", "faults", "packets", "autopilot's own", "its clearance"):
+    """Return what fits 80 columns: times to the goal, least distances between hull and obstacle, and both of theirs."""
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim")
+    for name in ("world", "time", "clearance", "contacts", "faults", "packets", "its own", "its clearance"):
         table.add_column(name, justify="left" if name in ("world", "faults") else "right")
     for run in runs:
         time_, clear = WORLDS[run.world]

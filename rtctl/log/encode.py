@@ -8,11 +8,13 @@ import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from rtctl.log import schema
+from rtctl.log.base_scene import BaseScene
 from rtctl.log.entry import Batch, Kind, Payload
 from rtctl.log.header import Header
 from rtctl.log.rows import Encoded, Rows, assembled, copies, message, rows_for, stamped
-from rtctl.log.scene import HZ, Scene
+from rtctl.log.scene import Scene
 from rtctl.log.schema import MESSAGE
+from rtctl.log.surroundings import HZ, Surroundings
 from rtctl.types import I64, U8
 
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
@@ -57,7 +59,7 @@ class Encoder:
         )
         self._has_state = {"q", "qd", "tau_measured"} <= set(header.dtype.names or ())
         self._can: dict[tuple[int, int], Rows] = {}
-        self._scene = Scene(header) if self._has_state else None
+        self._scene: Surroundings = Scene(header) if self._has_state else BaseScene(header)
         self._due = 0  # [ns] monotonic, of the next scene
         self._recent: deque[bytes] = deque(maxlen=EVIDENCE)  # the last ticks
         self._evidence: dict[int, list[bytes]] = {}  # by the index of a fault's entry in the batch
@@ -88,8 +90,8 @@ class Encoder:
         for index, (kind, payload, time) in enumerate(zip(batch.kind, batch.payload, batch.time, strict=True)):
             if kind == _TICK and len(payload) == size:
                 ticks.append(payload)
-                if time >= self._due and self._scene is not None:
-                    found += self._views(self._scene, np.frombuffer(payload, self.header.dtype)[0], time)
+                if time >= self._due:
+                    found += self._views(np.frombuffer(payload, self.header.dtype)[0], time)
             elif kind == _REQUEST:
                 found += self._asked(bytes(payload), time, ticks[-1] if ticks else None)
             elif kind == _EVENT:
@@ -100,21 +102,20 @@ class Encoder:
         self._recent.extend(bytes(each) for each in ticks[-EVIDENCE:])  # the ring's memory is not ours to keep
         return found
 
-    def _views(self, scene: Scene, record: Any, time: int) -> list[Encoded]:
+    def _views(self, record: Any, time: int) -> list[Encoded]:
         period = round(1e9 / HZ)
         self._due = max(self._due + period, time - period) if self._due else time + period
-        if not scene.can_show(record):
+        if not self._scene.can_show(record):
             return []
         stamp = time + self.offset
         return [
-            self._message(schema.TF, time, scene.frames(record, stamp)),
-            self._message(schema.SCENE, time, scene.update(record, stamp)),
+            self._message(schema.TF, time, self._scene.frames(record, stamp)),
+            self._message(schema.SCENE, time, self._scene.update(record, stamp)),
         ]
 
     def _asked(self, payload: bytes, time: int, tick: Payload | None) -> list[Encoded]:
         now = float(np.frombuffer(tick, self.header.dtype)["time"][0]) if tick is not None else 0.0
-        if self._scene is not None:
-            self._scene.request(payload, now)
+        self._scene.request(payload, now)
         data = event_of(payload)
         said = []
         if str(data.get("verb", "none")) != "none":

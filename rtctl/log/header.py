@@ -10,10 +10,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from rtctl.control.meshes import NONE, Meshes, added
 from rtctl.control.record import record_dtype
+from rtctl.types import Shape
 
 PACKAGES = (
     "rtctl",
@@ -29,7 +31,7 @@ PACKAGES = (
     "pymavlink",
 )
 
-SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing
+SCENE_FILE = "scene.json"  # attachment: base pose, points and fixed obstacles, for drawing, see scene_text
 
 MESH = "mesh/"  # before the names of attachments that hold solids
 FIXED = {"<f4", "<f8", "<i4", "<i8", "<u4", "<u8"}  # types of a record's fields
@@ -84,6 +86,16 @@ def make_header(
         extra=dict(extra or {}),
         files=dict(files or {}),
     )
+
+
+def scene_text(points: list[list[float]], obstacles: Sequence[Shape], **more: Any) -> str:
+    """Return the text of SCENE_FILE.
+
+    points: an arm's (link, x, y, z, radius) [m] in their links' frames, or a base's (x, y, radius).
+    """
+    shapes = [{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in s._asdict().items()} for s in obstacles]
+    text = msgspec.json.encode({"points": points, "obstacles": shapes, **more})  # which takes a cloud's bytes, too
+    return text.decode()
 
 
 def meshes_to_files(meshes: Meshes) -> dict[str, str]:

@@ -147,6 +147,9 @@ class Log:
         text = self.metadata.get(INFO, {}).get("clock_offset_ns", "0")
         return int(text) if text.lstrip("-").isdigit() else 0
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.topics)
+
     def __contains__(self, topic: str) -> bool:
         return topic in self.topics
 

@@ -13,10 +13,10 @@ def encode_request(tick: int, request: Request) -> bytes:
     """Return the JSON of what the tick of index `tick` was asked."""
     body: dict[str, Any] = {"tick": tick, "verb": request.verb.name.lower()}
     if request.goal is not None:
-        body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items()}
+        body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items() if v is not None}
     if request.obstacles:
         body["obstacles"] = [
-            {"name": e.name, "age": e.age, "feed": e.feed, "shape": None if e.shape is None else _shape(e.shape)}
+            {"name": e.name, "age": e.age, "feed": e.feed} | ({} if e.shape is None else {"shape": _shape(e.shape)})
             for e in request.obstacles
         ]
     return msgspec.json.encode(body)
@@ -30,7 +30,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
         edits = tuple(
             ObstacleEdit(
                 e["name"],
-                None if e["shape"] is None else _shape_of(e["shape"]),
+                None if e.get("shape") is None else _shape_of(e["shape"]),
                 float(e["age"]),
                 bool(e.get("feed", False)),  # logs of before there were feeds have none
             )

@@ -64,6 +64,9 @@ class Run:
         """Return the chunks met so far that could not be read."""
         return sum(log.damaged for log in self.logs)
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.topics)
+
     def __contains__(self, topic: str) -> bool:
         return topic in self.topics
 

@@ -4,7 +4,6 @@ A layout is a template of bytes that holds every tag and length, and a dtype tha
 a thousand messages is then one copy of the template and one numpy assignment per field, decoding one view.
 """
 
-import json
 import struct
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 
 from rtctl.log.header import Header
+from rtctl.log.json_schema import json_schema
 
 TICK = "/tick"
 JOINT_STATES = "/joint_states"
@@ -233,39 +233,14 @@ def _cdr_string(builder: _Builder, text: str) -> None:
     builder.literal(len(data).to_bytes(4, "little") + data)
 
 
-def _json_schema(title: str, properties: dict[str, Any], required: tuple[str, ...] = ()) -> bytes:
-    schema = {"title": title, "type": "object", "properties": properties, "required": list(required)}
-    return json.dumps(schema).encode()
-
-
-_INTEGER, _STRING, _OBJECT = {"type": "integer"}, {"type": "string"}, {"type": "object"}
-_EVENT_SCHEMA = _json_schema(
-    "rtctl.Event",
-    {
-        "tick": _INTEGER,
-        "time": {"type": "number", "description": "robot time [s]"},
-        "name": {"type": "string", "description": "state, fault, rejected, or a status"},
-        "detail": _STRING,
-        "evidence": {"type": "object", "description": "of a fault: fields of the last ticks, oldest first"},
-    },
+_JSON = (
+    (EVENT, "rtctl.Event"),
+    (REQUEST, "rtctl.Request"),
+    (CHECKPOINT, "rtctl.Checkpoint"),
+    (DROPOUT, "rtctl.Dropout"),
+    (SENTINEL, "rtctl.Sentinel"),
+    (POSITION, "rtctl.Position"),
 )
-_REQUEST_SCHEMA = _json_schema(
-    "rtctl.Request", {"tick": _INTEGER, "verb": _INTEGER, "goal": _OBJECT, "obstacles": {"type": "array"}}, ("tick",)
-)
-_CHECKPOINT_SCHEMA = _json_schema(
-    "rtctl.Checkpoint",
-    {
-        "tick": _INTEGER,
-        "layout": {"type": "string", "description": "fields that the program kept: another version cannot use it"},
-        "counters": {"type": "array", "description": "of each joint's newest protected frame"},
-        "memory": {"type": "array", "description": "of the tick; arrays by type and shape"},
-        "data": {"type": "string", "contentEncoding": "base64", "description": "the arrays' bytes, one behind another"},
-    },
-    ("tick",),
-)
-_DROPOUT_SCHEMA = _json_schema("rtctl.Dropout", {"count": _INTEGER, "from_ns": _INTEGER, "to_ns": _INTEGER}, ("count",))
-_SENTINEL_SCHEMA = _json_schema("rtctl.Sentinel", {"reason": _STRING, "detail": _STRING}, ("reason",))
-_POSITION_SCHEMA = _json_schema("rtctl.Position", {"entries": _INTEGER}, ("entries",))
 
 
 def channels(header: Header) -> tuple[Channel, ...]:
@@ -275,12 +250,7 @@ def channels(header: Header) -> tuple[Channel, ...]:
     rows = [
         (TICK, "protobuf", "rtctl.Tick", "protobuf", tick),
         (JOINT_STATES, "cdr", "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE_MSG.encode()),
-        (EVENT, "json", "rtctl.Event", "jsonschema", _EVENT_SCHEMA),
-        (REQUEST, "json", "rtctl.Request", "jsonschema", _REQUEST_SCHEMA),
-        (CHECKPOINT, "json", "rtctl.Checkpoint", "jsonschema", _CHECKPOINT_SCHEMA),
-        (DROPOUT, "json", "rtctl.Dropout", "jsonschema", _DROPOUT_SCHEMA),
-        (SENTINEL, "json", "rtctl.Sentinel", "jsonschema", _SENTINEL_SCHEMA),
-        (POSITION, "json", "rtctl.Position", "jsonschema", _POSITION_SCHEMA),
+        *((topic, "json", name, "jsonschema", json_schema(name)) for topic, name in _JSON),
         (LOG, "protobuf", "foxglove.Log", "protobuf", descriptor_set(Log.DESCRIPTOR)),
         (TF, "protobuf", "foxglove.FrameTransforms", "protobuf", descriptor_set(FrameTransforms.DESCRIPTOR)),
         (SCENE, "protobuf", "foxglove.SceneUpdate", "protobuf", descriptor_set(SceneUpdate.DESCRIPTOR)),

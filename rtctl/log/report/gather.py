@@ -16,7 +16,7 @@ from rtctl.log.fields import called
 from rtctl.log.header import Header
 from rtctl.log.report.bins import Bins, Histogram, Spectrum
 from rtctl.log.run import Run
-from rtctl.log.scene import Scene
+from rtctl.log.surroundings import Surroundings
 from rtctl.log.topic import Part, Structured
 from rtctl.types import F64, Cut, State, Status
 
@@ -108,7 +108,7 @@ class _Slots:
     """Which obstacle was in which slot, and where: from the requests."""
 
     def __init__(self, run: Run, header: Header) -> None:
-        scene = Scene(header)
+        scene = Surroundings(header)
         self.owner: dict[int, list[tuple[int, str]]] = {}  # slot -> (from tick, name)
         self.ways: dict[str, Way] = {}
         self.goals: list[list[float]] = []
