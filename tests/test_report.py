@@ -14,8 +14,8 @@ from rtctl.log import Kind, McapSink, make_header, read
 from rtctl.log.png import envelope
 from rtctl.log.report.bins import Bins, Histogram, Spectrum
 from rtctl.log.request import encode_event
-from tests.browser import Browser, missing
 from tests.lab import ROOT
+from tools.browser import Browser, missing
 
 GOLDEN = ROOT / "tests" / "golden" / "goals.mcap"
 

@@ -94,7 +94,7 @@ def obstacle(entity: Any, shape: dict[str, Any], elapsed: float, colour: Colour)
     elif kind == "plane":
         paint.a *= SHEER
         solid(entity.cubes.add(color=paint), p - rotation(wxyz)[:, 2] * 0.001, wxyz, [3.0, 3.0, 0.002])
-    text = entity.texts.add(text=str(shape.get("name", "")), billboard=True, font_size=0.03, scale_invariant=False)
+    text = entity.texts.add(text=str(shape.get("name", "")), billboard=True, font_size=0.05, scale_invariant=False)
     text.color.CopyFrom(paint_of(WHITE))
     put(text.pose, p, wxyz)
 

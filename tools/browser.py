@@ -1,4 +1,4 @@
-"""A headless Chromium driven over WebDriver's own HTTP: no more than a test of a page needs."""
+"""A headless Chromium driven over WebDriver's own HTTP: no more than looking at a page needs."""
 
 import base64
 import json
@@ -15,7 +15,6 @@ from typing import Any, Self
 FLAGS = (
     "--headless",
     "--no-sandbox",
-    "--disable-gpu",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -36,6 +35,9 @@ def missing() -> str:
 class Browser:
     """One session; everything it leaves goes with it."""
 
+    def __init__(self, flags: tuple[str, ...] = ("--disable-gpu",)) -> None:
+        self._flags = (*FLAGS, *flags)
+
     def __enter__(self) -> Self:
         self._folder = tempfile.TemporaryDirectory(prefix="rtctl-browser-", ignore_cleanup_errors=True)
         log = Path(self._folder.name) / "driver.log"
@@ -45,7 +47,10 @@ class Browser:
         )
         port = self._port(log)
         self._base = f"http://127.0.0.1:{port}/session"
-        options = {"binary": shutil.which("chromium"), "args": [*FLAGS, f"--user-data-dir={self._folder.name}/profile"]}
+        options = {
+            "binary": shutil.which("chromium"),
+            "args": [*self._flags, f"--user-data-dir={self._folder.name}/profile"],
+        }
         logs = {"browser": "ALL"}
         wanted = {"alwaysMatch": {"goog:chromeOptions": options, "goog:loggingPrefs": logs}}
         self._session = self._call("POST", "", {"capabilities": wanted})["sessionId"]
@@ -85,8 +90,12 @@ class Browser:
 
     def open(self, page: Path) -> None:
         """Open a file and wait until it says that it is ready."""
-        self._ask("POST", "/url", {"url": page.as_uri()})
+        self.go(page.as_uri())
         self.wait("document.body.dataset.ready === '1'")
+
+    def go(self, url: str) -> None:
+        """Open an address."""
+        self._ask("POST", "/url", {"url": url})
 
     def phone(self, width: int, height: int) -> None:
         """Lay the page out as on a phone: a headless window cannot be that narrow."""
