@@ -1,6 +1,6 @@
 """Open a log in Foxglove's own core, in a headless browser, and take its picture.
 
-    python -m tools.foxglove run.mcap --at 26 --png docs/foxglove.png
+    python -m tools.foxglove out/demo/logs/panda.mcap --at 26 --png docs/foxglove.png
     python -m tools.foxglove rover.mcap --layout configs/foxglove_rover.json --png /tmp/rover.png
 
 The core is the last one that was published as a package (@foxglove/studio-base, MPL-2.0); npm brings it into --cache,
