@@ -33,6 +33,17 @@ def test_a_motor_that_gives_half_its_torque_stops_the_arm_though_the_slew_follow
     assert 0.0 < after < 0.02
 
 
+def test_an_echo_is_judged_against_the_last_four_commands_and_no_older_one():
+    with lab() as here:
+        here.running()
+        here.ask([0.5, 0.3, 0.5], DOWN)
+        for _ in range(50):
+            here.step()
+        commands = [turn.command.tau for turn in here.turns[-4:]]
+        assert len({tau.tobytes() for tau in commands}) == 4  # on its way: each is another
+        np.testing.assert_array_equal(here.memory.sent, commands[::-1])
+
+
 def test_a_drive_that_says_it_gives_less_is_believed():
     arm = Standing()
     arm.ticks(5)
