@@ -19,6 +19,7 @@ from rtctl.config.scenario import Scenario, scenario_dict
 from rtctl.control import faults
 from rtctl.control.memory import Memory
 from rtctl.control.pipe import initial, tick
+from rtctl.control.primitives import Obstacles
 from rtctl.control.robot import Robot
 from rtctl.control.so3 import quat_of
 from rtctl.hal.can import CanLink
@@ -299,6 +300,13 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, float | np.floating):
         return np.float64(a).tobytes() == np.float64(b).tobytes()
     return bool(a == b)
+
+
+def without(obstacles: Obstacles, slot: int) -> Obstacles:
+    """Return the obstacles with a slot inactive."""
+    active = obstacles.active.copy()
+    active[slot] = False
+    return obstacles._replace(active=active)
 
 
 def leaves(value: Any, visit: Callable[[NDArray[Any]], None]) -> None:

@@ -23,7 +23,6 @@ from rtctl.control.primitives import (
     fault_of,
     obstacles_empty,
     with_shape,
-    without,
 )
 from rtctl.errors import ConfigError
 from rtctl.types import F64, Shape
@@ -39,6 +38,7 @@ from tests.bodies import (
     write_obj,
     write_stl,
 )
+from tests.lab import without
 
 MESHES = known(**{name.replace(" ", "_"): s for name, s in SURFACES.items()})
 surfaces = pytest.mark.parametrize("name", SURFACES)

@@ -21,9 +21,9 @@ from rtctl.control.primitives import (
     fault_of,
     obstacles_empty,
     with_shape,
-    without,
 )
 from rtctl.types import F64, Shape
+from tests.lab import without
 
 
 def shape(kind: str, *dims: float, position: F64 | None = None, wxyz: F64 | None = None, **motion: F64) -> Shape:

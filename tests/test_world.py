@@ -6,7 +6,7 @@ import pytest
 from rtctl.control import world
 from rtctl.control.world import World, advanced, distance_from, edited, empty, oldest, with_static
 from rtctl.types import ObstacleEdit, Shape
-from tests.lab import leaves, sphere
+from tests.lab import leaves, same, sphere
 
 ORIGIN = np.zeros(3)
 
@@ -55,6 +55,7 @@ def test_clearing_frees_the_slot_and_a_star_frees_all():
         (ObstacleEdit("a", sphere("a", [np.nan, 0.0, 0.0], 0.1)), "obstacle a: position"),
         (ObstacleEdit("a", sphere("a", [1e300, 0.0, 0.0], 0.1)), "obstacle a: position"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1, (1e200, 0.0, 0.0))), "obstacle a: velocity"),
+        (ObstacleEdit("a", sphere("a", [9e3, 0.0, 0.0], 0.1, (9e3, 0.0, 0.0)), 0.4), "obstacle a: position by now"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], -1.0)), "obstacle a: dims"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1)._replace(type="blob")), "obstacle a: type"),
         (ObstacleEdit("a", sphere("a", [0.0, 0.0, 0.0], 0.1)._replace(wxyz=np.zeros(4))), "obstacle a: wxyz"),
@@ -79,6 +80,24 @@ def test_a_refused_edit_does_not_keep_the_others_out():
     table, refusal = edited(empty(4), (bad, ObstacleEdit("good", sphere("good", [1.0, 0.0, 0.0], 0.1))))
     assert "bad" in refusal
     assert named(table) == {"good"}
+
+
+def test_edits_of_one_request_are_what_the_same_edits_one_by_one_are():
+    ball, box = sphere("ball", [1.0, 0.0, 0.0], 0.1, (0.2, 0.0, 0.0)), sphere("box", [0.0, 1.0, 0.0], 0.2)
+    part = sphere("part", [0.0, 0.0, 1.0], 0.1)._replace(group="union")
+    start = advanced(put(empty(4, creep=0.1), ball, box._replace(name="old"), age=0.2), 0.05)
+    edits = (
+        ObstacleEdit("ball", ball, 0.3), ObstacleEdit("box", box, 0.1, True), ObstacleEdit("old", None),
+        ObstacleEdit("ball", ball._replace(position=np.array([2.0, 0.0, 0.0]))), ObstacleEdit("part", part),
+        ObstacleEdit("box", None), ObstacleEdit("box", box._replace(group="union"), 0.2), ObstacleEdit("ghost", None),
+    )  # fmt: skip
+    at_once, refusal = edited(start, edits)
+    one_by_one = start
+    for each in edits:
+        one_by_one, _ = edited(one_by_one, (each,))
+    assert same(at_once, one_by_one)
+    assert refusal == "no obstacle is named ghost"
+    assert named(at_once) == {"ball", "box", "part"}
 
 
 def test_a_moving_obstacle_is_where_its_velocity_takes_it_and_one_at_rest_stays():

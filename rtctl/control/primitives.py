@@ -51,6 +51,7 @@ _TYPES: dict[str, tuple[int, int, int]] = {
     "cloud": (CLOUD, 1, 1),
 }
 TYPES = tuple(_TYPES)
+_NUMBERS = (("position", 3), ("wxyz", 4), ("velocity", 3), ("omega", 3), ("dims", 4))
 SIZE_MIN, SIZE_MAX = 1e-4, 100.0  # [m] of a dimension that must not be zero
 LARGEST = 1e4  # [m, m/s, rad/s] of any number: squares of larger ones could overflow
 N_MAX = 50.0  # edges of a 2n = 100 surface are round to 2 % of its size; beyond that use the box
@@ -98,18 +99,10 @@ def fault_of(shape: Shape, known: Meshes = meshes.NONE) -> str:
     """Return what is wrong with a shape as one line that names the field, or "" when it can be used."""
     if shape.type not in _TYPES:
         return f"type: got {shape.type!r}, wanted one of {', '.join(TYPES)}"
-    for name, value, count in (
-        ("position", shape.position, 3),
-        ("wxyz", shape.wxyz, 4),
-        ("velocity", shape.velocity, 3),
-        ("omega", shape.omega, 3),
-        ("dims", shape.dims, 4),
-    ):
-        if np.shape(value) != (count,) or not np.all(np.isfinite(value)):
-            return f"{name}: got {value}, wanted {count} finite numbers"
-        if np.max(np.abs(value)) > LARGEST:
-            return f"{name}: got {value}, wanted nothing beyond {LARGEST:g}"
-    if abs(float(np.linalg.norm(shape.wxyz)) - 1.0) > 1e-3:
+    for name, count in _NUMBERS:
+        if fault := fault_of_numbers(name, getattr(shape, name), count):
+            return fault
+    if abs(math.hypot(*shape.wxyz) - 1.0) > 1e-3:
         return f"wxyz: got {shape.wxyz}, wanted a unit quaternion"
     if shape.type == "mesh" and shape.mesh not in known.names:
         return f"mesh: got {shape.mesh!r}, wanted one of the config's: {', '.join(known.names) or 'it has none'}"
@@ -120,10 +113,21 @@ def fault_of(shape: Shape, known: Meshes = meshes.NONE) -> str:
     return _fault_of_dims(shape)
 
 
+def fault_of_numbers(name: str, value: F64, count: int) -> str:
+    """Return what is wrong with an array of a shape as one line, or ""."""
+    known = isinstance(value, np.ndarray) and value.shape == (count,)
+    numbers = value.tolist() if known else [math.nan]  # a list of its own: ufuncs cost ten times as much
+    if not all(map(math.isfinite, numbers)):
+        return f"{name}: got {value}, wanted {count} finite numbers"
+    if max(map(abs, numbers)) > LARGEST:
+        return f"{name}: got {value}, wanted nothing beyond {LARGEST:g}"
+    return ""
+
+
 def _fault_of_dims(shape: Shape) -> str:
     """Return what is wrong with the dims of a known type, or ""."""
     _, count, zero = _TYPES[shape.type]
-    for i, value in enumerate(shape.dims[: min(count, 3)]):
+    for i, value in enumerate(shape.dims[: min(count, 3)].tolist()):
         least = 0.0 if i < zero else SIZE_MIN
         if not least <= value <= SIZE_MAX:
             return f"dims[{i}]: got {value} m, wanted {least} to {SIZE_MAX}"
@@ -170,10 +174,17 @@ def with_shape(
     be used, and on one cloud too many; ask first where that is a value.
     """
     fault = fault_of(shape, known)
-    place = cloud_place(obstacles, slot) if shape.type == "cloud" else 0
-    if fault or place < 0:
+    if fault or (shape.type == "cloud" and cloud_place(obstacles, slot) < 0):
         raise ValueError(fault or f"cloud: there are {CLOUDS} already")
-    new = copied(obstacles)
+    new = put_shape(copied(obstacles), slot, shape, known)
+    new.group[slot] = slot if group < 0 else group
+    new.margin[slot] = 0.0
+    return new
+
+
+def put_shape(new: Obstacles, slot: int, shape: Shape, known: Meshes) -> Obstacles:
+    """Write a shape without fault into a slot of arrays that are the caller's own; group and margin stay."""
+    place = cloud_place(new, slot) if shape.type == "cloud" else 0
     new.kind[slot] = _TYPES[shape.type][0]
     new.active[slot] = True
     new.R[slot] = R_of(np.asarray(shape.wxyz, np.float64))
@@ -181,8 +192,6 @@ def with_shape(
     new.v[slot] = shape.velocity
     new.w[slot] = shape.omega
     new.dims[slot] = _stored_dims(shape)
-    new.group[slot] = slot if group < 0 else group
-    new.margin[slot] = 0.0
     if shape.type == "mesh":
         start = known.start(shape.mesh)
         new.dims[slot] = 0.0, 0.0, known.data[start + 2], start, 0.0
@@ -202,13 +211,6 @@ def copied(obstacles: Obstacles) -> Obstacles:
         o.kind.copy(), o.active.copy(), o.R.copy(), o.p.copy(), o.v.copy(), o.w.copy(), o.dims.copy(), o.group.copy(),
         o.margin.copy(), o.mesh, o.clouds,
     )  # fmt: skip
-
-
-def without(obstacles: Obstacles, slot: int) -> Obstacles:
-    """Return the obstacles with `slot` inactive."""
-    active = obstacles.active.copy()
-    active[slot] = False
-    return obstacles._replace(active=active)
 
 
 def advance(obstacles: Obstacles, dt: float) -> Obstacles:

@@ -13,11 +13,12 @@ from rtctl.control.primitives import (
     Obstacles,
     advanced_pose,
     cloud_place,
+    copied,
     distances_into,
     fault_of,
+    fault_of_numbers,
     obstacles_empty,
-    with_shape,
-    without,
+    put_shape,
 )
 from rtctl.types import B1, F64, ObstacleEdit, Shape
 
@@ -60,46 +61,60 @@ def with_static(world: World, shapes: tuple[Shape, ...]) -> World:
 
 def edited(world: World, edits: tuple[ObstacleEdit, ...]) -> tuple[World, str]:
     """Return the table after `edits`, and why an edit was refused ('' when none was)."""
-    refusal = ""
+    refusal, own = "", False
     for edit in edits:
-        slots = [i for i, name in enumerate(world.names) if name and edit.name in (name, "*")]
-        if edit.name in ("", "*") and edit.shape is not None:
-            refusal = f"obstacle: got {edit.name!r}, wanted a name"
+        slots = [i for i, name in enumerate(world.names) if name] if edit.name == "*" else _slot_of(world, edit.name)
+        fault = _refused(world, edit, slots)
+        if fault:
+            refusal = fault
             continue
-        if edit.name != "*" and slots and world.fixed[slots[0]]:
-            refusal = f"obstacle {edit.name}: is the config's own"
-            continue
+        if not own:  # all edits of one tick go into one copy
+            own, obstacles = True, copied(world.obstacles)
+            world = world._replace(obstacles=obstacles, age=world.age.copy(), moving=world.moving.copy())
         if edit.shape is None:
             for slot in [s for s in slots if not world.fixed[s]]:
-                world = _without(world, slot)
-            if not slots and edit.name != "*":
-                refusal = f"no obstacle is named {edit.name}"
-            continue
-        slot = slots[0] if slots else next((i for i, name in enumerate(world.names) if not name), -1)
-        if slot < 0:
-            refusal = f"obstacle {edit.name}: all {len(world.names)} slots are taken"
-            continue
-        fault = fault_of(edit.shape, world.known)
-        if not fault and edit.shape.type == "cloud" and cloud_place(world.obstacles, slot) < 0:
-            fault = f"there are {CLOUDS} clouds already"
-        if not 0.0 <= edit.age <= AGE_MAX:
-            fault = f"age: got {edit.age} s, wanted 0 to {AGE_MAX:g}"
-        if fault:
-            refusal = f"obstacle {edit.name}: {fault}"
-            continue
-        world = _with(world, slot, edit)
+                world = _cleared(world, slot)
+        else:
+            world = _put(world, slots[0] if slots else world.names.index(""), edit, edit.shape)
     return world, refusal
 
 
-def _with(world: World, slot: int, edit: ObstacleEdit) -> World:
-    assert edit.shape is not None
-    age, moving = world.age.copy(), world.moving.copy()
-    age[slot] = edit.age
-    shape = edit.shape._replace(position=edit.shape.position + edit.age * edit.shape.velocity)
-    moving[slot] = edit.feed or bool(np.any(shape.velocity != 0.0) or np.any(shape.omega != 0.0))
-    obstacles = with_shape(world.obstacles, slot, shape, known=world.known)._replace(margin=world.obstacles.margin)
-    world = world._replace(obstacles=obstacles, names=_at(world.names, slot, edit.name), age=age, moving=moving)
-    return _with_margins(_joined(world, slot, shape.group))
+def _slot_of(world: World, name: str) -> list[int]:
+    return [world.names.index(name)] if name and name in world.names else []
+
+
+def _refused(world: World, edit: ObstacleEdit, slots: list[int]) -> str:
+    """Return why an edit of what is in `slots` cannot be made, or ""."""
+    shape, all_of_them = edit.shape, edit.name == "*"
+    if shape is not None and (not edit.name or all_of_them):
+        return f"obstacle: got {edit.name!r}, wanted a name"
+    if slots and not all_of_them and world.fixed[slots[0]]:
+        return f"obstacle {edit.name}: is the config's own"
+    if shape is None:
+        return "" if slots or all_of_them else f"no obstacle is named {edit.name}"
+    if not slots and "" not in world.names:
+        return f"obstacle {edit.name}: all {len(world.names)} slots are taken"
+    fault = fault_of(shape, world.known)
+    if not fault and shape.type == "cloud":
+        slot = slots[0] if slots else world.names.index("")
+        fault = f"there are {CLOUDS} clouds already" if cloud_place(world.obstacles, slot) < 0 else ""
+    if not 0.0 <= edit.age <= AGE_MAX:
+        fault = f"age: got {edit.age} s, wanted 0 to {AGE_MAX:g}"
+    if not fault:
+        fault = fault_of_numbers("position by now", shape.position + edit.age * shape.velocity, 3)
+    return f"obstacle {edit.name}: {fault}" if fault else ""
+
+
+def _put(world: World, slot: int, edit: ObstacleEdit, shape: Shape) -> World:
+    """Write a shape without fault, `edit.age` [s] on, into a slot of a table whose arrays are the caller's own."""
+    shape = shape._replace(position=shape.position + edit.age * shape.velocity)
+    obstacles = put_shape(world.obstacles, slot, shape, world.known)
+    world.age[slot] = edit.age
+    world.moving[slot] = edit.feed or any(shape.velocity.tolist()) or any(shape.omega.tolist())
+    grown = max(world.creep * min(edit.age, world.stale), float(obstacles.margin[slot]))
+    obstacles.margin[slot] = grown if world.moving[slot] else 0.0
+    names = world.names if world.names[slot] else _at(world.names, slot, edit.name)
+    return _joined(world._replace(obstacles=obstacles, names=names), slot, shape.group)
 
 
 def _at(texts: tuple[str, ...], slot: int, text: str) -> tuple[str, ...]:
@@ -115,11 +130,11 @@ def _joined(world: World, slot: int, union: str) -> World:
     return world._replace(unions=unions, obstacles=world.obstacles._replace(group=group))
 
 
-def _without(world: World, slot: int) -> World:
-    moving = world.moving.copy()
-    moving[slot] = False
-    world = world._replace(obstacles=without(world.obstacles, slot), names=_at(world.names, slot, ""), moving=moving)
-    return _with_margins(_joined(world, slot, ""))
+def _cleared(world: World, slot: int) -> World:
+    """Clear a slot of a table whose arrays are the caller's own."""
+    world.moving[slot] = world.obstacles.active[slot] = False
+    world.obstacles.margin[slot] = 0.0
+    return _joined(world._replace(names=_at(world.names, slot, "")), slot, "")
 
 
 def _with_margins(world: World) -> World:
