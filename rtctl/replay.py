@@ -191,12 +191,10 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     subject = (_base if run.header.extra.get("kind") == "base" else _arm)(run, config)
     marks = _marks(run) if subject.robot is not None else []
     begun = time.perf_counter()
-    first = next(inputs(run.logs, subject.feedbacks), None)
-    if first is None:
-        raise LogError(f"{run.path}: no tick in it")
-    whole = int(first.record["tick"]) == 0
+    first = _first_tick(run)
+    whole = first == 0
     if not whole and not marks:
-        raise LogError(f"{run.path}: begins with tick {first.record['tick']}; what was before it is missing")
+        raise LogError(f"{run.path}: begins with tick {first}; what was before it is missing")
     gc.freeze()  # robot and kernels will not be garbage: looking through them again costs a twentieth
     digest = hashlib.sha256()
     try:
@@ -215,6 +213,14 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
         done[0].divergence, done[0].differences, done[0].ignored, seconds, ticks * subject.dt,
         *(np.concatenate([getattr(part, name) for part in full]) for name in ("time", "logged", "replayed")),
     )  # fmt: skip
+
+
+def _first_tick(run: Run) -> int:
+    for log in run.logs:
+        for piece in log.pieces(schema.TICK):
+            if len(piece):
+                return int(piece.array["tick"][0])
+    raise LogError(f"{run.path}: no tick in it")
 
 
 def _marks(run: Run) -> list[_Mark]:

@@ -48,15 +48,16 @@ def feedbacks_of(records: Structured) -> Iterator[Feedback]:
         )
 
 
-def requests_of(log: Log) -> dict[int, Request]:
+def requests_of(log: Log, span: tuple[int, int] = EVERYTHING) -> dict[int, Request]:
     """Return the requests by the tick they reached; ticks that were asked nothing are absent.
 
-    Raises LogError when one cannot be read: a replay without it would not be one.
+    span: of log_time [ns], as in `inputs`: a request bears its tick's. Raises LogError when one cannot be read: a
+    replay without it would not be one.
     """
     found: dict[int, Request] = {}
     if schema.REQUEST not in log:
         return found
-    for payload in log[schema.REQUEST].payloads:
+    for payload in (log[schema.REQUEST] if span == EVERYTHING else log.window(schema.REQUEST, *span)).payloads:
         try:
             tick, request = decode_request(payload)
         except (ValueError, RecursionError) as error:
@@ -78,7 +79,7 @@ def inputs(
     """
     expected = -1
     for log in logs:
-        requests = requests_of(log)
+        requests = requests_of(log, span)
         for piece in log.pieces(schema.TICK) if span == EVERYTHING else (log.window(schema.TICK, *span),):
             records = piece.array
             ticks, times = records["tick"].tolist(), piece.time.tolist()
