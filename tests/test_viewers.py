@@ -10,15 +10,20 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from rtctl.log import read
+from rtctl.control.record import record_dtype
+from rtctl.log import make_header, read
+from rtctl.log.header import meshes_to_files
 from rtctl.log.request import encode_request
+from rtctl.log.scene import Scene
 from rtctl.sim import simulate
 from rtctl.types import Cut, Goal, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
 from tests.arms import panda
 from tests.base_lab import ROVER
+from tests.bodies import SURFACES, known, sampled
 from tests.lab import PANDA, ROOT, recorded, robot
 
 ARM_SCENE = f"""
@@ -184,6 +189,47 @@ def test_a_rovers_log_shows_it_where_it_was_with_its_goal_its_way_and_what_it_sa
     away = np.abs(np.hypot(*(np.array(seen) - (20.0, 0.0)).T) - 2.0)
     assert len(seen) > 100
     assert np.quantile(away, 0.9) < 0.3  # the scan is up to 0.1 s old: it moved and turned since
+
+
+def corners_of(cube: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return centre (3,), axes as columns (3, 3) and half sizes (3,) [m] of a cube that is drawn."""
+    pose = cube.pose
+    R = pin.Quaternion(*(getattr(pose.orientation, a) for a in "wxyz")).toRotationMatrix()
+    centre = np.array([pose.position.x, pose.position.y, pose.position.z])
+    return centre, R, 0.5 * np.array([cube.size.x, cube.size.y, cube.size.z])
+
+
+def held(points: np.ndarray[Any, Any], cubes: Any, slack: float = 1e-9) -> np.ndarray[Any, Any]:
+    """Return which points (n, 3) lie in some cube."""
+    found = np.zeros(len(points), bool)
+    for centre, R, half in map(corners_of, cubes):
+        found |= np.all(np.abs((points - centre) @ R) <= half + slack, axis=1)
+    return found
+
+
+def test_meshes_and_clouds_are_drawn_as_boxes_that_hold_them_and_little_else():
+    rng, radius, step = np.random.default_rng(3), 0.01, 0.001
+    turn = np.array([0.8, 0.0, 0.6, 0.0])
+    R, at, z = pin.Quaternion(*turn).toRotationMatrix(), np.array([0.5, -0.2, 0.3]), np.zeros(3)
+    ring = rng.uniform(0.0, 2.0 * np.pi, 3000)
+    steps = np.round(np.column_stack([300 * np.cos(ring), 300 * np.sin(ring), rng.uniform(-20, 20, 3000)])).astype(
+        "<i2"
+    )
+    cloud = Shape("ring", "cloud", np.array([radius, step, 0.0, 0.0]), at, turn, z, z, cloud=steps.tobytes())
+    mesh = Shape("torus", "mesh", np.zeros(4), -at, turn, z, z, mesh="torus")
+    header = make_header("panda", robot().joints, 8, 1e-3, files=meshes_to_files(known(torus=SURFACES["torus"])))
+    scene = Scene(header)
+    scene.request(encode_request(0, Request(obstacles=tuple(ObstacleEdit(s.name, s) for s in (cloud, mesh)))), 0.0)
+    drawn = {e.id: e for e in SceneUpdate.FromString(scene.update(np.zeros((), record_dtype(7, 8)), 0)).entities}
+    points, surface = at + steps * step @ R.T, -at + sampled(SURFACES["torus"], 3000, rng) @ R.T
+    for axis in np.vstack([AXES, -AXES]):
+        assert held(points + radius * axis, drawn["obstacle ring"].cubes).all()
+    assert held(surface, drawn["obstacle torus"].cubes).all()
+    for name, centre, size in (("ring", at, 0.32), ("torus", -at, 0.2)):
+        cubes = drawn[f"obstacle {name}"].cubes
+        assert 8 < len(cubes) <= 64
+        assert not held(centre[None], cubes).any()  # the hole is seen
+        assert all(np.abs((c - centre) @ R).max() <= size for c, _, _ in map(corners_of, cubes))
 
 
 # ---- layouts

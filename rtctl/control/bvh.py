@@ -25,6 +25,15 @@ ON = 1e-9  # [m] nearer to the surface than this, a direction is not taken from 
 _SLACK = 1e-9  # [m] and relative: far above the rounding errors of any distance
 
 
+def boxes_of(body: F64, most: int) -> F64:
+    """Return the boxes (k, 6) [m] of one level of a body's tree, k at most `most`: together they hold all its items."""
+    level = 1
+    while 2 * level <= min(most, int(body[1])):
+        level *= 2
+    boxes = body[HEAD + 6 * level : HEAD + 12 * level].reshape(level, 6)
+    return boxes[np.all(boxes[:, :3] <= boxes[:, 3:], axis=1)]  # a leaf without items has none
+
+
 @njit(cache=True, fastmath=False)
 def leaves_for(count: int, per_leaf: int) -> int:
     """Return the least power of two of leaves that hold at most `per_leaf` items each."""

@@ -29,6 +29,11 @@ class Meshes(NamedTuple):
         """Return where the body of a name begins, -1 where there is none."""
         return self.starts[self.names.index(name)] if name in self.names else -1
 
+    def body(self, name: str) -> F64:
+        """Return the body of a name. Raises ValueError where there is none."""
+        at = self.names.index(name)
+        return self.data[self.starts[at] : self.starts[at + 1] if at + 1 < len(self.starts) else None]
+
 
 NONE = Meshes((), (), np.zeros(0))
 

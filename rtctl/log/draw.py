@@ -64,8 +64,11 @@ def along(direction: F64) -> tuple[float, float, float, float]:
     return w / size, 0.0, -z / size, y / size
 
 
-def obstacle(entity: Any, shape: dict[str, Any], elapsed: float, colour: Colour) -> None:
-    """Add the primitives of one obstacle, `elapsed` [s] after it was where its shape says."""
+def obstacle(entity: Any, shape: dict[str, Any], boxes: F64, elapsed: float, colour: Colour) -> None:
+    """Add the primitives of one obstacle, `elapsed` [s] after it was where its shape says.
+
+    boxes (k, 6) [m]: least and greatest x y z in its frame, for a mesh or a cloud.
+    """
     kind = str(shape.get("type", ""))
     a, b, c = (float(v) for v in [*shape.get("dims", ()), 0.0, 0.0, 0.0][:3])
     p = np.array(shape.get("position", (0, 0, 0)), np.float64)
@@ -94,6 +97,8 @@ def obstacle(entity: Any, shape: dict[str, Any], elapsed: float, colour: Colour)
     elif kind == "plane":
         paint.a *= SHEER
         solid(entity.cubes.add(color=paint), p - rotation(wxyz)[:, 2] * 0.001, wxyz, [3.0, 3.0, 0.002])
+    for low, high in zip(boxes[:, :3], boxes[:, 3:], strict=True):
+        solid(entity.cubes.add(color=paint), p + rotation(wxyz) @ (0.5 * (low + high)), wxyz, (high - low).tolist())
     text = entity.texts.add(text=str(shape.get("name", "")), billboard=True, font_size=0.05, scale_invariant=False)
     text.color.CopyFrom(paint_of(WHITE))
     put(text.pose, p, wxyz)

@@ -3,17 +3,24 @@
 Obstacles are followed by the same rule as the controller's own table: the first free slot, extrapolated by velocity.
 """
 
+import base64
 import json
+from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from rtctl.control import bvh
+from rtctl.control.meshes import Meshes
 from rtctl.log import draw
-from rtctl.log.header import SCENE_FILE, Header
+from rtctl.log.header import SCENE_FILE, Header, meshes_of
+from rtctl.types import F64
 
 HZ = 30.0
+GRID = 4  # cells a side, of a cloud
+BOXES = GRID**3  # drawn of one mesh or cloud at most
 LARGEST = 1e6  # [m, rad, N] of anything drawn; comparing is false for NaN
 
 
@@ -22,15 +29,15 @@ class Thing(NamedTuple):
 
     shape: dict[str, Any]
     time: float  # [s] robot time for which its position holds
+    boxes: F64  # (k, 6) [m] of a mesh or a cloud, see draw.obstacle
 
 
 class Surroundings:
     """Follows the obstacles of the config and of the requests."""
 
-    drawn: ClassVar[tuple[str, ...]] = ()  # fields of a record without which nothing can be shown
-
     def __init__(self, header: Header) -> None:
         self.about = _json(header.files.get(SCENE_FILE, ""))
+        self._header = header
         self._slots: list[str] = [""] * header.slots
         self._things: dict[str, Thing] = {}
         self._gone: list[str] = []
@@ -56,7 +63,24 @@ class Surroundings:
             if "" not in self._slots:
                 return
             self._slots[self._slots.index("")] = name
-        self._things[name] = Thing(shape, time)
+        self._things[name] = Thing(shape, time, self._boxes_of(shape))
+
+    def _boxes_of(self, shape: dict[str, Any]) -> F64:
+        """Return (k, 6) [m] boxes about the surface of a mesh or the points of a cloud; none for other shapes."""
+        try:
+            if shape.get("type") == "mesh":
+                return bvh.boxes_of(self._solids.body(str(shape["mesh"])), BOXES)
+            if shape.get("type") == "cloud":
+                radius, step = (float(v) for v in shape["dims"][:2])
+                points = np.frombuffer(base64.b64decode(shape["cloud"]), "<i2").reshape(-1, 3) * step
+                return _boxed(points, radius)
+        except (ValueError, KeyError, TypeError, IndexError):  # as the log has it
+            pass
+        return np.zeros((0, 6))
+
+    @cached_property
+    def _solids(self) -> Meshes:
+        return meshes_of(self._header)
 
     def _clear(self, name: str) -> None:
         del self._things[name]
@@ -71,22 +95,28 @@ class Surroundings:
         """Return the obstacles as they were last told."""
         return [thing.shape for thing in self._things.values()]
 
+
+class View(Surroundings, ABC):
+    """What moves among the obstacles, and how all of it is drawn."""
+
+    drawn: ClassVar[tuple[str, ...]]  # fields of a record without which nothing can be shown
+
     def can_show(self, record: Any) -> bool:
         """Return whether a record's numbers can be drawn: a log takes whatever bits a tick had."""
         names = record.dtype.names or ()
         return all(name in names and bool((np.abs(record[name]) < LARGEST).all()) for name in self.drawn)
 
+    @abstractmethod
     def frames(self, record: Any, ns: int) -> bytes:
         """Return foxglove.FrameTransforms of what moves at log_time `ns`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def own(self, message: Any, record: Any, ns: int) -> None:
         """Add to a SceneUpdate what is drawn beside the obstacles."""
-        raise NotImplementedError
 
+    @abstractmethod
     def body(self, message: Any) -> None:
         """Add to a SceneUpdate what hangs on the frames and never changes."""
-        raise NotImplementedError
 
     @cached_property
     def _body(self) -> bytes:
@@ -102,12 +132,21 @@ class Surroundings:
             draw.stamped(message.deletions.add(type=0, id=_called(name)).timestamp, ns)
         self._gone.clear()
         now = float(record["time"])
-        for name, (shape, told) in self._things.items():
+        for name, (shape, told, boxes) in self._things.items():
             colour = draw.GREY if name in self._fixed else draw.BLUE
-            draw.obstacle(draw.entity_of(message, _called(name), ns), shape, now - told, colour)
+            draw.obstacle(draw.entity_of(message, _called(name), ns), shape, boxes, now - told, colour)
         self.own(message, record, ns)
         data: bytes = message.SerializeToString(deterministic=True) + self._body  # repeated fields add up
         return data
+
+
+def _boxed(points: F64, radius: float) -> F64:
+    """Return at most BOXES boxes (k, 6) [m] that hold the balls about points (n, 3), cell by cell of a grid."""
+    low, size = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-9)
+    cells = np.minimum((points - low) / size * GRID, GRID - 1).astype(np.int64)
+    number = cells @ (GRID * GRID, GRID, 1)
+    parts = [points[number == each] for each in np.unique(number)]
+    return np.array([[*(part.min(axis=0) - radius), *(part.max(axis=0) + radius)] for part in parts])
 
 
 def _called(name: str) -> str:
