@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rtctl.config import Config, scales
+from rtctl.config.assets import files_named
 from rtctl.config.obstacles import quaternion
 from rtctl.config.urdf import package_folders, urdf_file
 from rtctl.control.robot import Robot
@@ -44,7 +45,7 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
     text = urdf.read_text(encoding="utf-8")
     files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
     files |= meshes_to_files(robot.meshes)
-    if meshes := archive(text, urdf.parent, package_folders(urdf), _assets(config), path.resolve().parent):
+    if meshes := archive(text, urdf.parent, package_folders(urdf), files_named(config), path.resolve().parent):
         files[MESHES] = meshes
     return make_header(
         robot.name,
@@ -56,12 +57,6 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
         extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
         files=files,
     )
-
-
-def _assets(config: Config) -> tuple[str, ...]:
-    """Return the files that a config's meshes and obstacles name."""
-    named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
-    return tuple(sorted({str(name) for name in named if name}))
 
 
 def drive_dbc(config: Config) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rtctl.config.assets import files_named
 from rtctl.config.base import BaseConfig
 from rtctl.config.base_derive import key_of
 from rtctl.control.base import faults
@@ -21,7 +22,8 @@ from rtctl.hal.mavlink_keys import Keys
 from rtctl.hal.messages import Bounds
 from rtctl.hal.wire import Wire, open_wire
 from rtctl.log.entry import Kind
-from rtctl.log.header import SCENE_FILE, Header, make_header, scene_text
+from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files, scene_text
+from rtctl.log.mesh import MESHES, archive
 from rtctl.servo import Machine, Servo, Sink
 from rtctl.types import State, Status, Task
 
@@ -103,10 +105,16 @@ def header_of(config: BaseConfig, path: Path, base: Base, start: BaseFeedback, *
     pose = np.array([*start.position, start.yaw])
     whole = start._replace(slot=max(start.slot, 0))  # a record has no slot before the first
     first = make_base_record(base.slots, **whole._asdict()).tobytes().hex()  # all of it, for a replay
+    files: dict[str, str | bytes] = {
+        SCENE_FILE: scene_text(np.column_stack([base.points, base.point_radius]).tolist(), base.obstacles)
+    }
+    files |= meshes_to_files(base.meshes)
+    if packed := archive("", path.parent, (), files_named(config), path.resolve().parent):
+        files[MESHES] = packed
     header = make_header(
         base.name, (), base.slots, base.dt, config=path.read_text(encoding="utf-8"), buses=(),
         extra={"pose_handshake": pose.tobytes().hex(), "kind": "base", "start": first, **extra},
-        files={SCENE_FILE: scene_text(np.column_stack([base.points, base.point_radius]).tolist(), base.obstacles)},
+        files=files,
     )  # fmt: skip
     return header._replace(dtype=base_dtype(base.slots), links=(LINK,))
 

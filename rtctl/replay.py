@@ -145,7 +145,7 @@ def _base(run: Run, config: Path | None) -> _Subject:
     header = run.header
     with tempfile.TemporaryDirectory(prefix="rtctl-replay-") as name:
         path = Path(name) / "config.toml"
-        path.write_text(header.config, encoding="utf-8")
+        path.write_text(unpacked("", header.config, header.files, path.parent)[1], encoding="utf-8")
         path = path if config is None else config
         base = build(load(path), path)
     try:

@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from firmware_sim.vehicle import Traits, Vehicle
+from rtctl.base import header_of
 from rtctl.config.base import load
 from rtctl.config.base_derive import build
 from rtctl.control import world
@@ -20,11 +22,16 @@ from rtctl.control.base.chart import CELL, SIZE, STENCIL
 from rtctl.control.base.record import feedback_from
 from rtctl.control.base.robot import SECTORS, Wheels
 from rtctl.control.base.signals import Ask, BaseFeedback, at_rest
+from rtctl.errors import LogError
 from rtctl.log import read
+from rtctl.log.base_scene import BaseScene
 from rtctl.log.request import decode_request
+from rtctl.log.run import read_run
 from rtctl.log.writer import McapSink
+from rtctl.replay import replay
 from rtctl.types import Link, ObstacleEdit, Request, Shape, State, Verb
 from tests.base_lab import ROVER, UPRIGHT, BaseLab, goal_at
+from tests.bodies import box
 
 BASE = build(load(ROVER), ROVER)
 RANDOM = np.random.default_rng(5)
@@ -299,8 +306,6 @@ def test_goals_that_make_no_sense_are_refused_with_the_reason():
 
 
 def test_a_log_replays_to_the_same_bytes_and_nothing_compiles_after_warm(tmp_path):
-    from rtctl.base import header_of
-
     pipe.warm(BASE)
     compiled: list[str] = []
     disc = {"name": "d", "type": "cylinder", "radius_m": 1.0, "length_m": 2.0, "position_m": [8.0, 0.2, 0.0]}
@@ -329,3 +334,21 @@ class _Listener(event.Listener):
 
     def on_end(self, e):
         pass
+
+
+def test_a_log_carries_the_files_that_its_configs_obstacles_come_from(tmp_path: Path):
+    config, shape = tmp_path / "rover.toml", box(1.0, 1.0, 1.0)
+    lines = [f"v {x} {y} {z}" for x, y, z in shape.V] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in shape.T]
+    (tmp_path / "rock.obj").write_text("\n".join(lines))
+    np.save(tmp_path / "heap.npy", RANDOM.uniform(-0.5, 0.5, (50, 3)))
+    files = ('type = "mesh"\nfile = "rock.obj"', 'type = "cloud"\nfile = "heap.npy"\npoint_radius_m = 0.1')
+    obstacles = [f'[[obstacle]]\nname = "o{k}"\nposition_m = [9.0, 0.0, 0.0]\n{file}' for k, file in enumerate(files)]
+    config.write_text("\n".join([ROVER.read_text(), *obstacles]))
+    base = build(load(config), config)
+    McapSink(tmp_path / "run.mcap", header_of(load(config), config, base, at_rest(np.zeros(2), 0.0))).close("end")
+    for name in ("rock.obj", "heap.npy", "rover.toml"):
+        (tmp_path / name).unlink()
+    with pytest.raises(LogError, match="no tick in it"):  # it gets that far
+        replay(read_run(tmp_path / "run.mcap"))
+    drawn = [shape["type"] for shape in BaseScene(read_run(tmp_path / "run.mcap").header).shapes()]
+    assert drawn == ["mesh", "cloud"]

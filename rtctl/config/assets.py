@@ -24,6 +24,12 @@ WHOLE = 32767  # steps from the centre, of int16
 COARSER = 1.25  # factor on the voxels of a cloud that has still too many points
 
 
+def files_named(config: Any) -> tuple[str, ...]:
+    """Return the files that a config's meshes and obstacles name, an arm's or a base's."""
+    named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
+    return tuple(sorted({str(name) for name in named if name}))
+
+
 class Packed(NamedTuple):
     """A cloud as the controller takes it; every ball of the points it was made from lies within its balls."""
 
