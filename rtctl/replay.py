@@ -216,10 +216,9 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
 
 
 def _first_tick(run: Run) -> int:
-    for log in run.logs:
-        for piece in log.pieces(schema.TICK):
-            if len(piece):
-                return int(piece.array["tick"][0])
+    for piece in run.pieces(schema.TICK):
+        if len(piece):
+            return int(piece.array["tick"][0])
     raise LogError(f"{run.path}: no tick in it")
 
 

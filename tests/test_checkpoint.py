@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from rtctl import config as cfg
 from rtctl import replay as module
@@ -201,17 +203,35 @@ def test_a_checkpoint_that_is_not_what_the_ticks_lead_to_is_no_ground_to_stand_o
 
 @pytest.mark.usefixtures("built")
 def test_a_log_that_lost_its_beginning_is_replayed_from_its_first_checkpoint(
-    log: Path, monkeypatch: pytest.MonkeyPatch
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    whole = module.inputs
-
-    def cut(logs: Any, feedbacks: Any, span: tuple[int, int] = module.EVERYTHING) -> Any:
-        yield from (one for one in whole(logs, feedbacks, span) if one.record["tick"] >= 150)
-
-    monkeypatch.setattr(module, "inputs", cut)
-    done = replay(read_run(log))
+    cut = tmp_path / "run.mcap"
+    without_start(log, cut, int(read_run(log)["/tick"].time[150]))
+    done = replay(read_run(cut))
     assert done.identical
     assert (done.ticks, done.time[0]) == (1298 - 300, pytest.approx(0.3))
     monkeypatch.setattr(module, "_marks", lambda run: [])
     with pytest.raises(LogError, match="begins with tick 150"):
-        replay(read_run(log))
+        replay(read_run(cut))
+
+
+def without_start(log: Path, cut: Path, start: int) -> None:
+    """Write a log again without the messages before log_time `start` [ns]."""
+    with log.open("rb") as source, cut.open("wb") as target:
+        reader, writer = make_reader(source), Writer(target, compression=CompressionType.ZSTD)
+        writer.start()
+        found = reader.get_summary()
+        assert found is not None
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(attachment.create_time, attachment.log_time, attachment.name,
+                                  attachment.media_type, attachment.data)  # fmt: skip
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        schemas = {k: writer.register_schema(s.name, s.encoding, s.data) for k, s in found.schemas.items()}
+        ids = {k: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+               for k, c in found.channels.items()}  # fmt: skip
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            if message.log_time >= start:
+                writer.add_message(ids[channel.id], message.log_time, message.data, message.publish_time,
+                                   message.sequence)  # fmt: skip
+        writer.finish()
