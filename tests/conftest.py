@@ -1,5 +1,7 @@
 """What every test shares: compiled code that is never stale, and repeatable property tests."""
 
+import signal
+
 from hypothesis import settings
 
 import rtctl  # noqa: F401  its import names the kernel cache after the sources, for this process and its children
@@ -7,3 +9,7 @@ import rtctl  # noqa: F401  its import names the kernel cache after the sources,
 # No deadline: compilation and a busy machine are not failures. Derandomised: a red run is red again.
 settings.register_profile("rtctl", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("rtctl")
+
+# A shell's background job ignores SIGINT, and so would every program that a test starts and interrupts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
