@@ -183,8 +183,9 @@ def _commanded(
         velocity = v_ref * min(1.0, allowed / speed) if speed > 1e-6 else np.zeros(2)
         v, w = law.unicycle(base, v_ref, _ahead(base, m)[1])
         v = math.copysign(min(abs(v), allowed), v)
-        v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
-        w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
+        if m.state == State.RUN:
+            v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
+            w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
     if m.state != State.RUN and ask == Ask.DRIVE and m.state != State.STOPPING:
         v, w, velocity = 0.0, 0.0, np.zeros(2)
     sent = np.concatenate([[[v, w]], m.sent[:-1]])
