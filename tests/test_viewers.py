@@ -232,6 +232,27 @@ def test_meshes_and_clouds_are_drawn_as_boxes_that_hold_them_and_little_else():
         assert all(np.abs((c - centre) @ R).max() <= size for c, _, _ in map(corners_of, cubes))
 
 
+GOOD = {"type": "sphere", "dims": [0.1, 0, 0, 0], "position": [0, 0, 0], "wxyz": [1, 0, 0, 0],
+        "velocity": [0, 0, 0], "omega": [0, 0, 0]}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        5, {"shape": 5}, {"shape": {}}, {"shape": GOOD, "age": "x"}, {"shape": GOOD, "age": None},
+        *({"shape": {**GOOD, name: value}} for name in ("dims", "position", "wxyz", "velocity", "omega")
+          for value in (None, "abc", [None] * 4, [0.0], [1e300] * 4)),
+    ],
+)  # fmt: skip
+def test_a_request_that_no_table_would_take_is_not_drawn_and_takes_no_slot(edit: Any):
+    scene = Scene(make_header("panda", robot().joints, 8, 1e-3))
+    bad = {**edit, "name": "bad"} if isinstance(edit, dict) else edit
+    scene.request(json.dumps({"obstacles": [bad, {"name": "good", "shape": GOOD}]}).encode(), 0.0)
+    drawn = SceneUpdate.FromString(scene.update(np.zeros((), record_dtype(7, 8)), 0)).entities
+    assert [e.id for e in drawn if e.id.startswith("obstacle")] == ["obstacle good"]
+    assert scene.name_of(0) == "good"
+
+
 # ---- layouts
 
 

@@ -51,7 +51,7 @@ _TYPES: dict[str, tuple[int, int, int]] = {
     "cloud": (CLOUD, 1, 1),
 }
 TYPES = tuple(_TYPES)
-_NUMBERS = (("position", 3), ("wxyz", 4), ("velocity", 3), ("omega", 3), ("dims", 4))
+NUMBERS = (("position", 3), ("wxyz", 4), ("velocity", 3), ("omega", 3), ("dims", 4))  # arrays of a Shape
 SIZE_MIN, SIZE_MAX = 1e-4, 100.0  # [m] of a dimension that must not be zero
 LARGEST = 1e4  # [m, m/s, rad/s] of any number: squares of larger ones could overflow
 N_MAX = 50.0  # edges of a 2n = 100 surface are round to 2 % of its size; beyond that use the box
@@ -99,7 +99,7 @@ def fault_of(shape: Shape, known: Meshes = meshes.NONE) -> str:
     """Return what is wrong with a shape as one line that names the field, or "" when it can be used."""
     if shape.type not in _TYPES:
         return f"type: got {shape.type!r}, wanted one of {', '.join(TYPES)}"
-    for name, count in _NUMBERS:
+    for name, count in NUMBERS:
         if fault := fault_of_numbers(name, getattr(shape, name), count):
             return fault
     if abs(math.hypot(*shape.wxyz) - 1.0) > 1e-3:

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from rtctl.control import bvh
 from rtctl.control.meshes import Meshes
+from rtctl.control.primitives import LARGEST, NUMBERS
 from rtctl.log import draw
 from rtctl.log.header import SCENE_FILE, Header, meshes_of
 from rtctl.types import F64
@@ -21,7 +22,7 @@ from rtctl.types import F64
 HZ = 30.0
 GRID = 4  # cells a side, of a cloud
 BOXES = GRID**3  # drawn of one mesh or cloud at most
-LARGEST = 1e6  # [m, rad, N] of anything drawn; comparing is false for NaN
+BOUND = 1e6  # [m, rad, N] of anything drawn; comparing is false for NaN
 
 
 class Thing(NamedTuple):
@@ -42,17 +43,20 @@ class Surroundings:
         self._things: dict[str, Thing] = {}
         self._gone: list[str] = []
         for shape in self.about.get("obstacles", ()):
-            self._set(shape, 0.0)
+            if _is_shape(shape):
+                self._set(shape, 0.0)
         self._fixed = set(self._things)
 
     def request(self, payload: bytes, time: float) -> None:
         """Take a request's obstacles into account; time [s] of the robot."""
         edits = _json(payload.decode("utf-8", "replace")).get("obstacles", ())
         for edit in edits if isinstance(edits, list) else ():
-            name, shape = str(edit.get("name", "")), edit.get("shape")
-            if isinstance(shape, dict):
-                if name not in self._fixed:
-                    self._set({**shape, "name": name}, time - float(edit.get("age") or 0.0))
+            if not isinstance(edit, dict):
+                continue
+            name, shape, age = str(edit.get("name", "")), edit.get("shape"), edit.get("age", 0.0)
+            if shape is not None:
+                if name not in self._fixed and _are_numbers([age], 1) and _is_shape(shape):
+                    self._set({**shape, "name": name}, time - age)
                 continue
             for each in [n for n in self._things if name in (n, "*") and n not in self._fixed]:
                 self._clear(each)
@@ -104,7 +108,7 @@ class View(Surroundings, ABC):
     def can_show(self, record: Any) -> bool:
         """Return whether a record's numbers can be drawn: a log takes whatever bits a tick had."""
         names = record.dtype.names or ()
-        return all(name in names and bool((np.abs(record[name]) < LARGEST).all()) for name in self.drawn)
+        return all(name in names and bool((np.abs(record[name]) < BOUND).all()) for name in self.drawn)
 
     @abstractmethod
     def frames(self, record: Any, ns: int) -> bytes:
@@ -138,6 +142,16 @@ class View(Surroundings, ABC):
         self.own(message, record, ns)
         data: bytes = message.SerializeToString(deterministic=True) + self._body  # repeated fields add up
         return data
+
+
+def _is_shape(shape: Any) -> bool:
+    """Return whether a shape is one that the controller's table takes: it refuses others, and they are not drawn."""
+    return isinstance(shape, dict) and all(_are_numbers(shape.get(name), count) for name, count in NUMBERS)
+
+
+def _are_numbers(values: Any, count: int) -> bool:
+    known = isinstance(values, list) and len(values) == count
+    return known and all(isinstance(v, int | float) and abs(v) <= LARGEST for v in values)
 
 
 def _boxed(points: F64, radius: float) -> F64:
