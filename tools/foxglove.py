@@ -75,6 +75,10 @@ class Files(SimpleHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with a range of a file when one is asked for, else with all of it."""
+        with suppress(BrokenPipeError, ConnectionResetError):  # the core hangs up when it has read enough
+            self._answer()
+
+    def _answer(self) -> None:
         asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
         path = Path(self.translate_path(self.path))
         if asked is None or not path.is_file():
@@ -86,7 +90,7 @@ class Files(SimpleHTTPRequestHandler):
         self.send_header("Content-Range", f"bytes {first}-{last}/{size}")
         self.send_header("Content-Length", str(last - first + 1))
         self.end_headers()
-        with path.open("rb") as file, suppress(BrokenPipeError, ConnectionResetError):  # it had read enough
+        with path.open("rb") as file:
             file.seek(first)
             self.wfile.write(file.read(last - first + 1))
 
@@ -133,7 +137,9 @@ def look(site: Path, log: Path, layout: Path, at: float, wait: float, png: Path)
             browser.run(f"{tab}.click()")
             time.sleep(1.0)
             said = browser.run("return document.body.innerText")
-            problems = re.findall(r"^.*(?:Error|Unsupported|Failed).*$", said, re.M)
+            found = re.search(r"^Problems\n(?:\d+\n)?(.*?)^3D$", said, re.M | re.S)  # up to the first panel's title
+            problems = [line for line in found[1].splitlines() if line] if found else ["the list was not found"]
+            problems = [line for line in problems if line != "No problems found"]
             browser.run("document.querySelector('.MuiTabs-vertical [role=tab]').click()")  # the side bar goes
             time.sleep(3.0)
             browser.picture(png)
@@ -152,10 +158,12 @@ def main() -> int:
     parser.add_argument("--png", type=Path, default=Path("out/foxglove.png"), help="(%(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("out/foxglove"), help="for the packages (%(default)s)")
     arguments = parser.parse_args()
-    lacking = missing() or ("" if shutil.which("npm") else "npm not installed: apt-get install -y npm")
+    absent = [f"{path}: no such file" for path in (arguments.log, arguments.layout) if not path.is_file()]
+    lacking = "; ".join(absent) or missing() or ("" if shutil.which("npm") else "npm: apt-get install -y npm")
     if lacking:
         print(f"foxglove: {lacking}", file=sys.stderr)
         return 1
+    arguments.png.parent.mkdir(parents=True, exist_ok=True)
     site = fetched(arguments.cache)
     topics, problems = look(site, arguments.log, arguments.layout, arguments.at, arguments.wait, arguments.png)
     print(json.dumps({"topics": topics, "problems": problems, "png": str(arguments.png)}, indent=1))
