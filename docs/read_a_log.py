@@ -8,9 +8,9 @@ import sys
 
 import numpy as np
 
-from rtctl.control.faults import names
+from rtctl.arm.faults import names
 from rtctl.log import read, read_run
-from rtctl.log.fields import FIELDS
+from rtctl.log.read.fields import FIELDS
 from rtctl.types import Status
 
 

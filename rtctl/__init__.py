@@ -15,7 +15,8 @@ def _kernel_cache() -> Path:
     """
     here = Path(__file__).resolve().parent
     digest = hashlib.sha256()
-    for path in sorted([*here.glob("control/**/*.py"), *here.glob("protocol/*.py")]):
+    rooms = ("kernel", "protocol", "world", "control", "arm", "rover", "design")
+    for path in sorted(path for room in rooms for path in here.glob(f"{room}/**/*.py")):
         digest.update(str(path.relative_to(here)).encode() + b"\0" + path.read_bytes())
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(base) / "rtctl" / digest.hexdigest()[:16]

@@ -239,4 +239,4 @@ class Simulator(Protocol):
     def close(self) -> None: ...
 
 
-Record = NDArray[Any]  # one element of control.record.record_dtype(n, K)
+Record = NDArray[Any]  # one element of arm.record.record_dtype(n, K)

@@ -8,9 +8,9 @@ import numpy as np
 import pybullet
 from scipy.spatial.transform import Rotation
 
-from rtctl.config.urdf import package_folders, urdf_file
-from rtctl.control.model import RigidBody
-from rtctl.control.points import Points
+from rtctl.arm.model import RigidBody
+from rtctl.arm.points import Points
+from rtctl.spec.urdf import package_folders, urdf_file
 from rtctl.types import F64
 
 PANDA = urdf_file("package://example-robot-data/robots/panda_description/urdf/panda.urdf", Path("panda.toml"))

@@ -7,14 +7,14 @@ import numpy as np
 
 from firmware_sim import plane
 from firmware_sim.rover import Rover, open_rover
-from rtctl.base import machine_of, open_link
-from rtctl.config.base import load
-from rtctl.config.base_derive import build
-from rtctl.control.base import faults
-from rtctl.control.base.signals import Ask
+from rtctl.app.rover import machine_of, open_link
+from rtctl.app.servo import Servo
+from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
-from rtctl.hal.wire import InProcess
-from rtctl.servo import Servo
+from rtctl.hal.mavlink.wire import InProcess
+from rtctl.rover import faults
+from rtctl.rover.signals import Ask
+from rtctl.spec.base import load
 from rtctl.types import Goal, ObstacleEdit, Request, State, Status, Task, Verb
 
 CONFIGS = Path(__file__).parents[1] / "configs"

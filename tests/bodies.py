@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.control.meshes import NONE, Meshes, added, mesh_body
 from rtctl.types import F64, I64, Shape
+from rtctl.world.meshes import NONE, Meshes, added, mesh_body
 
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
 

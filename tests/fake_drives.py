@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-from rtctl.hal.can import MIT, MIT_E2E, JointSpec, LinkSpec
+from rtctl.hal.can.link import MIT, MIT_E2E, JointSpec, LinkSpec
 from rtctl.protocol import frame, mit
 
 SCALE = mit.Scale(12.5, 45.0, 54.0)

@@ -12,21 +12,21 @@ from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from firmware_sim.simulator import open_simulator
-from rtctl import config as cfg
-from rtctl.assembly import link_spec
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario, scenario_dict
-from rtctl.control import faults
-from rtctl.control.memory import Memory
-from rtctl.control.pipe import initial, tick
-from rtctl.control.primitives import Obstacles
-from rtctl.control.robot import Robot
-from rtctl.control.so3 import quat_of
-from rtctl.hal.can import CanLink
+from rtctl import design as cfg
+from rtctl.app.arm import link_spec
+from rtctl.app.servo import Servo, Turn, first_feedback
+from rtctl.app.sim import Feed, Tally, simulate
+from rtctl.arm import faults
+from rtctl.arm.memory import Memory
+from rtctl.arm.pipe import initial, tick
+from rtctl.arm.robot import Robot
+from rtctl.hal.can.handshake import handshake
+from rtctl.hal.can.link import CanLink
+from rtctl.hal.can.transport import InProcess
 from rtctl.hal.clock import Slot
-from rtctl.hal.transport import InProcess
-from rtctl.servo import Servo, Turn, first_feedback
-from rtctl.sim import Feed, Tally, simulate
+from rtctl.kernel.rotations import quat_of
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario, scenario_dict
 from rtctl.types import (
     F64,
     Command,
@@ -42,6 +42,7 @@ from rtctl.types import (
     Truth,
     Verb,
 )
+from rtctl.world.primitives import Obstacles
 from tests.arms import PANDA_HOME
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -128,7 +129,7 @@ class Lab:
         """`simulator` is firmware_sim's; rtctl knows it by its protocol alone."""
         self.robot, self.simulator = robot(path), simulator
         self.link = CanLink(link_spec(cfg.load(path)), InProcess.of(self.simulator))
-        greeting = self.link.handshake(listen=0.0, recover=True)
+        greeting = handshake(self.link, listen=0.0, recover=True)
         self.servo = Servo(self.robot, self.link, None, greeting.q)
         self.first = first_feedback(greeting.q)
         self.turns: list[Turn] = []

@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from rtctl import cli, config
-from rtctl.config.base import BaseConfig, load
-from rtctl.config.base_derive import build
-from rtctl.config.read import convert
-from rtctl.config.rules import refuse
+from rtctl import cli, design
+from rtctl.design.rover import build
 from rtctl.errors import EXIT_CONFIG, EXIT_OK, ConfigError
+from rtctl.spec.base import BaseConfig, load
+from rtctl.spec.read import convert
+from rtctl.spec.rules import refuse
 from tests.base_lab import CONFIGS, ROVER, ROVER_PX4
 from tests.config_leaves import alternatives, bounds, dotted, leaves, specimen
 
@@ -155,11 +155,11 @@ def test_a_footprint_of_corners_becomes_points_that_cover_its_outline(tmp_path):
 
 
 def test_the_schema_is_the_shipped_one_and_an_arms_file_is_no_bases():
-    assert json.loads((CONFIGS / "schema_base.json").read_text()) == config.json_schema(BaseConfig)
-    assert not config.is_base(CONFIGS / "panda.toml")
-    assert config.is_base(ROVER)
+    assert json.loads((CONFIGS / "schema_base.json").read_text()) == design.json_schema(BaseConfig)
+    assert not design.is_base(CONFIGS / "panda.toml")
+    assert design.is_base(ROVER)
     arms = msgspec.toml.decode((CONFIGS / "panda.toml").read_bytes())
     arms["robot"]["kind"] = "base"
-    checked = convert(arms, config.Config, "f")
+    checked = convert(arms, design.Config, "f")
     with pytest.raises(ConfigError, match=r"robot\.kind: got base, wanted arm"):
         refuse(checked, "f")

@@ -7,8 +7,8 @@ import pytest
 
 from firmware_sim.inject import fault_at
 from firmware_sim.rover import KINDS
-from rtctl.control.base import faults
-from rtctl.control.base.signals import Ask
+from rtctl.rover import faults
+from rtctl.rover.signals import Ask
 from rtctl.types import State, Status, Verb
 from tests.base_lab import ROVER, ROVER_PX4, BaseLab
 

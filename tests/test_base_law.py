@@ -13,23 +13,23 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from firmware_sim.vehicle import Traits, Vehicle
-from rtctl.base import header_of
-from rtctl.config.base import load
-from rtctl.config.base_derive import build
-from rtctl.control import world
-from rtctl.control.base import chart, detour, estimate, faults, law, pipe
-from rtctl.control.base.chart import CELL, SIZE, STENCIL
-from rtctl.control.base.record import feedback_from
-from rtctl.control.base.robot import SECTORS, Wheels
-from rtctl.control.base.signals import Ask, BaseFeedback, at_rest
+from rtctl.app.replay import replay
+from rtctl.app.rover import header_of
+from rtctl.design.rover import build
 from rtctl.errors import LogError
 from rtctl.log import read
-from rtctl.log.base_scene import BaseScene
-from rtctl.log.request import decode_request
-from rtctl.log.run import read_run
-from rtctl.log.writer import McapSink
-from rtctl.replay import replay
+from rtctl.log.read.run import read_run
+from rtctl.log.record.requests import decode_request
+from rtctl.log.record.rover_scene import BaseScene
+from rtctl.log.record.writer import McapSink
+from rtctl.rover import estimator, faults, law, occupancy, path, pipe
+from rtctl.rover.occupancy import CELL, SIZE, STENCIL
+from rtctl.rover.record import feedback_from
+from rtctl.rover.robot import SECTORS, Wheels
+from rtctl.rover.signals import Ask, BaseFeedback, at_rest
+from rtctl.spec.base import load
 from rtctl.types import Link, ObstacleEdit, Request, Shape, State, Verb
+from rtctl.world import obstacle_table
 from tests.base_lab import ROVER, UPRIGHT, BaseLab, goal_at
 from tests.bodies import box
 
@@ -37,9 +37,9 @@ BASE = build(load(ROVER), ROVER)
 RANDOM = np.random.default_rng(5)
 
 
-def charted(points) -> chart.Chart:
+def charted(points) -> occupancy.Chart:
     """Return a chart with returns in the cells of points (m, 2) [m]."""
-    empty = chart.empty(np.zeros(2))
+    empty = occupancy.empty(np.zeros(2))
     cells = empty.cells.copy()
     for i, j in np.floor(np.asarray(points) / CELL).astype(int) - empty.origin:
         cells[i, j] = 3
@@ -48,20 +48,20 @@ def charted(points) -> chart.Chart:
 
 def test_free_distance_is_the_euclidean_one_up_to_its_stencil():
     seen = charted(RANDOM.uniform(-20.0, 20.0, (60, 2)))
-    free = chart.free_distance(seen, world.empty().obstacles, 0.3)
+    free = occupancy.free_distance(seen, obstacle_table.empty().obstacles, 0.3)
     oracle = ndimage.distance_transform_edt(seen.cells == 0) * CELL
     np.testing.assert_allclose(free, np.minimum(oracle, STENCIL * CELL), atol=1e-9)
 
 
 def test_told_obstacles_count_in_it_where_their_height_is_cut():
     box = Shape("b", "box", np.array([1.0, 2.0, 0.5, 0.0]), np.array([3.0, 1.0, 0.5]), UPRIGHT, *np.zeros((2, 3)))
-    table, _ = world.edited(world.empty(), (ObstacleEdit("b", box),))
-    seen = chart.empty(np.zeros(2))
-    free = chart.free_distance(seen, table.obstacles, 0.3)
+    table, _ = obstacle_table.edited(obstacle_table.empty(), (ObstacleEdit("b", box),))
+    seen = occupancy.empty(np.zeros(2))
+    free = occupancy.free_distance(seen, table.obstacles, 0.3)
     x, y = ((np.indices((SIZE, SIZE)).transpose(1, 2, 0) + seen.origin + 0.5) * CELL).transpose(2, 0, 1)
     flat = np.hypot(np.maximum(np.abs(x - 3.0) - 1.0, 0.0), np.maximum(np.abs(y - 1.0) - 2.0, 0.0))
     np.testing.assert_allclose(free, np.minimum(flat, STENCIL * CELL), atol=1e-9)
-    above = chart.free_distance(seen, table.obstacles, 2.0)
+    above = occupancy.free_distance(seen, table.obstacles, 2.0)
     assert above.min() == pytest.approx(1.0)
 
 
@@ -70,29 +70,29 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
     scan = np.full(SECTORS, np.inf)
     scan[0], scan[18] = 5.0, 3.0  # ahead, and to the right
     yaw = math.radians(90.0)
-    seen = chart.looked(chart.empty(np.zeros(2)), np.array([1.0, 2.0]), yaw, scan, 0.0, step, 12.0)
-    near = chart.returns_near(seen, np.array([1.0, 2.0]), 8.0)
+    seen = occupancy.looked(occupancy.empty(np.zeros(2)), np.array([1.0, 2.0]), yaw, scan, 0.0, step, 12.0)
+    near = occupancy.returns_near(seen, np.array([1.0, 2.0]), 8.0)
     oracle = np.array([[1.0, 7.0], [4.0, 2.0]])
     assert len(near) == 2
     for at in oracle:
         assert np.abs(near - at).max(axis=1).min() <= 0.5 * CELL + 1e-9
     clear = np.full(SECTORS, np.inf)
     for _ in range(3):
-        seen = chart.looked(seen, np.array([1.0, 2.0]), yaw, clear, 0.0, step, 12.0)
+        seen = occupancy.looked(seen, np.array([1.0, 2.0]), yaw, clear, 0.0, step, 12.0)
     assert not seen.cells.any()
     kept = charted([[10.0, 3.0]])
-    away = chart.moved(kept, np.array([25.0, 0.0]))
-    before, after = (chart.returns_near(c, np.array([10.0, 3.0]), 1.0) for c in (kept, away))
+    away = occupancy.moved(kept, np.array([25.0, 0.0]))
+    before, after = (occupancy.returns_near(c, np.array([10.0, 3.0]), 1.0) for c in (kept, away))
     np.testing.assert_allclose(after, before)
-    assert chart.moved(kept, np.array([200.0, 0.0])).cells.sum() == 0
+    assert occupancy.moved(kept, np.array([200.0, 0.0])).cells.sum() == 0
 
 
 def test_the_way_is_as_short_as_brute_force_over_the_cells_finds_and_keeps_its_room():
     wall = [(8.0, y) for y in np.arange(-6.0, 6.0, 0.2)] + [(x, 6.0) for x in np.arange(2.0, 8.0, 0.2)]
     seen = charted(wall)
-    free = chart.free_distance(seen, world.empty().obstacles, 0.3)
+    free = occupancy.free_distance(seen, obstacle_table.empty().obstacles, 0.3)
     x, goal, room = np.zeros(2), np.array([16.0, 1.0]), 1.3
-    way = detour.way_to(free, seen.origin, x, goal, room, detour.NO_WAY)
+    way = path.way_to(free, seen.origin, x, goal, room, path.NO_WAY)
     assert way.short == 0.0
     shortest = _brute(free >= room, x, goal, seen.origin)
     assert way.length <= shortest + 0.5 * CELL  # pulled taut it is shorter than steps along cells
@@ -123,16 +123,16 @@ def _brute(open_cells, x, goal, origin) -> float:
 def test_a_way_once_chosen_is_kept_before_the_middle_of_a_wall_and_left_when_it_closes():
     wall = [(8.0, y) for y in np.arange(-5.0, 5.0, 0.2)]
     seen = charted(wall)
-    free = chart.free_distance(seen, world.empty().obstacles, 0.3)
+    free = occupancy.free_distance(seen, obstacle_table.empty().obstacles, 0.3)
     goal = np.array([16.0, 0.0])
-    way = detour.way_to(free, seen.origin, np.array([0.0, 0.4]), goal, 1.3, detour.NO_WAY)
+    way = path.way_to(free, seen.origin, np.array([0.0, 0.4]), goal, 1.3, path.NO_WAY)
     side = np.sign(way.corners[0, 1])
     for y in (0.2, 0.0, -0.2, -0.4, 0.3, -0.3):
-        way = detour.way_to(free, seen.origin, np.array([0.0, y]), goal, 1.3, way)
+        way = path.way_to(free, seen.origin, np.array([0.0, y]), goal, 1.3, way)
         assert np.sign(way.corners[0, 1]) == side
     closed = charted(wall + [(8.0, side * y) for y in np.arange(5.0, 12.0, 0.2)])
-    free = chart.free_distance(closed, world.empty().obstacles, 0.3)
-    way = detour.way_to(free, closed.origin, np.array([0.0, 0.0]), goal, 1.3, way)
+    free = occupancy.free_distance(closed, obstacle_table.empty().obstacles, 0.3)
+    way = path.way_to(free, closed.origin, np.array([0.0, 0.0]), goal, 1.3, way)
     assert np.sign(way.corners[0, 1]) == -side
 
 
@@ -144,7 +144,7 @@ def test_the_push_of_returns_is_the_gradient_of_the_potential_and_does_not_grow_
         return 0.5 * f.eta * (1.0 / rho - 1.0 / f.rho0) ** 2
 
     x, at, h = np.zeros(2), np.array([1.2, 0.5]), 1e-6
-    none = world.empty().obstacles
+    none = obstacle_table.empty().obstacles
     push = law.field(BASE, x, 0.3, np.zeros(2), at[None], 1, none)
     slope = [(potential(x + h * e, at) - potential(x - h * e, at)) / (2.0 * h) for e in np.eye(2)]
     np.testing.assert_allclose(push.seen, -np.array(slope), rtol=1e-6)
@@ -205,7 +205,7 @@ def test_from_the_speed_that_the_governor_allows_the_vehicle_stops_short_of_what
         car.step(speed, 0.0, 0.0, 0.02)
     sent = np.full(law.history(BASE), speed)
     wall = np.array([[car.x + 6.0, y] for y in np.arange(-3.0, 3.0, 0.1)])
-    none = world.empty().obstacles
+    none = obstacle_table.empty().obstacles
     for _ in range(600):
         x = np.array([car.x, car.y])
         push = law.field(BASE, x, 0.0, np.zeros(2), wall, len(wall), none)
@@ -218,7 +218,7 @@ def test_from_the_speed_that_the_governor_allows_the_vehicle_stops_short_of_what
 
 def test_the_governor_sees_told_obstacles_as_far_off_as_they_are():
     ball = Shape("b", "sphere", np.array([0.7, 0, 0, 0]), np.array([5.0, 0.4, 0.3]), UPRIGHT, *np.zeros((2, 3)))
-    table, _ = world.edited(world.empty(), (ObstacleEdit("b", ball),))
+    table, _ = obstacle_table.edited(obstacle_table.empty(), (ObstacleEdit("b", ball),))
     r = BASE.margins.hull + BASE.margins.stop
     gap = law._gap_told(np.zeros(2), np.array([1.0, 0.0]), r, 0.3, table.obstacles, 30.0)
     assert gap == pytest.approx(5.0 - math.sqrt((0.7 + r) ** 2 - 0.4**2), abs=0.02)
@@ -227,17 +227,17 @@ def test_the_governor_sees_told_obstacles_as_far_off_as_they_are():
 
 def test_estimate_is_filterpys_on_the_same_model():
     noise, dt = BASE.noise, 0.02
-    e = estimate.start(np.array([1.0, -2.0]), 0.0, noise)
+    e = estimator.start(np.array([1.0, -2.0]), 0.0, noise)
     oracle = KalmanFilter(2, 2)
     oracle.x, oracle.P, oracle.H = np.array([1.0, 0.0]), e.P.copy(), np.eye(2)
     oracle.F = np.array([[1.0, dt], [0.0, 1.0]])
     g = np.array([0.5 * dt * dt, dt])
     oracle.Q = noise.acceleration**2 * np.outer(g, g)
     for _ in range(50):
-        e = estimate.predicted(e, dt, noise)
+        e = estimator.predicted(e, dt, noise)
         oracle.predict()
         z, v, age = RANDOM.normal(1.0, 0.1, 2), RANDOM.normal(0.0, 0.1, 2), RANDOM.uniform(0.0, 0.1)
-        e, _ = estimate.measured(e, z, v, age, noise)
+        e, _ = estimator.measured(e, z, v, age, noise)
         R = np.diag([noise.position**2 + (0.5 * noise.acceleration * age**2) ** 2,
                      noise.velocity**2 + (noise.acceleration * age) ** 2])  # fmt: skip
         oracle.update(np.array([z[0] + age * v[0], v[0]]), R=R)

@@ -20,15 +20,15 @@ from pamoja import mavlink as pamoja
 from firmware_sim.inject import fault_at
 from firmware_sim.rover import KINDS
 from firmware_sim.rover_serve import open_port
-from rtctl.control.base.signals import Ask, BaseCommand
 from rtctl.errors import HandshakeError, LinkError
-from rtctl.hal.mavlink import dialect
-from rtctl.hal.mavlink_talk import Order, Talk, Word, stream
-from rtctl.hal.mavlink_view import Clock, local_of
-from rtctl.hal.wire import Udp, open_wire
+from rtctl.hal.mavlink.link import dialect
+from rtctl.hal.mavlink.talk import Order, Talk, Word, stream
+from rtctl.hal.mavlink.view import Clock, local_of
+from rtctl.hal.mavlink.wire import Udp, open_wire
 from rtctl.log import read
-from rtctl.log.tlog import export_tlog
-from rtctl.log.writer import McapSink
+from rtctl.log.record.writer import McapSink
+from rtctl.log.view.tlog import export_tlog
+from rtctl.rover.signals import Ask, BaseCommand
 from rtctl.types import Link, State, Verb
 from tests.base_lab import ROVER, ROVER_PX4, BaseLab
 
@@ -310,9 +310,9 @@ def test_a_wrong_autopilot_vehicle_or_silence_is_refused_at_the_start(tmp_path):
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(ROVER.read_text().replace('"ardupilot"', '"px4"'))
     from firmware_sim import rover
-    from rtctl.base import open_link
-    from rtctl.config.base import load
-    from rtctl.hal.wire import InProcess
+    from rtctl.app.rover import open_link
+    from rtctl.hal.mavlink.wire import InProcess
+    from rtctl.spec.base import load
 
     config = load(wrong)
     double = rover.open_rover(ROVER)
@@ -444,7 +444,7 @@ def test_all_bytes_are_in_the_log_and_pymavlinks_own_reader_takes_the_tlog(tmp_p
         (sent if way == "up" else received).extend(packets)
         return packets
 
-    from rtctl.base import header_of
+    from rtctl.app.rover import header_of
 
     probe = BaseLab()
     sink = McapSink(tmp_path / "run.mcap", header_of(probe.config, Path(ROVER), probe.base, probe.start))

@@ -6,7 +6,7 @@ The oracle is the double's own geometry: distances of the footprint to the solid
 import numpy as np
 import pytest
 
-from rtctl.sim import simulate
+from rtctl.app.sim import simulate
 from rtctl.types import ObstacleEdit, Shape, State, Status, Verb
 from tests.base_lab import CONFIGS, ROVER, ROVER_PX4, UPRIGHT, BaseLab, Relay, some_world
 

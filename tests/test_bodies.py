@@ -9,11 +9,13 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rtctl.config.assets import load_cloud, load_mesh, packed
-from rtctl.config.files import read_cloud
-from rtctl.control.field import CONTACT, field, field_buffers, field_params
-from rtctl.control.meshes import mesh_body
-from rtctl.control.primitives import (
+from rtctl.arm.field import CONTACT, field, field_buffers, field_params
+from rtctl.design.assets import load_cloud, load_mesh, packed
+from rtctl.errors import ConfigError
+from rtctl.spec.files import read_cloud
+from rtctl.types import F64, Shape
+from rtctl.world.meshes import mesh_body
+from rtctl.world.primitives import (
     CLOUD_POINTS,
     CLOUDS,
     Obstacles,
@@ -24,8 +26,6 @@ from rtctl.control.primitives import (
     obstacles_empty,
     with_shape,
 )
-from rtctl.errors import ConfigError
-from rtctl.types import F64, Shape
 from tests.bodies import (
     SURFACES,
     Surface,
@@ -128,7 +128,7 @@ def test_on_the_surface_of_a_mesh_the_normal_neither_flips_nor_fades(name: str) 
 def test_a_surface_turned_inside_out_is_the_same_solid_and_a_hull_fills_it() -> None:
     s, X = SURFACES["ell"], about(SURFACES["ell"], 500, np.random.default_rng(5))
     rho, _ = measured("ell", X)
-    from rtctl.control.meshes import NONE, added
+    from rtctl.world.meshes import NONE, added
 
     turned = added(NONE, "it", mesh_body(s.V, s.T[:, ::-1]))
     assert np.array_equal(distance(mesh_shape("it"), X, turned)[0], rho)
@@ -321,7 +321,7 @@ def test_there_is_room_for_some_clouds_and_a_new_one_takes_the_place_of_an_old()
 def test_mesh_files_are_read_as_what_was_written(form: str, tmp_path: Path) -> None:
     s, path = SURFACES["ell"], tmp_path / f"it.{form}"
     write_obj(path, s, 0.001) if form == "obj" else write_stl(path, s, form == "ascii.stl")
-    from rtctl.control.meshes import NONE, added
+    from rtctl.world.meshes import NONE, added
 
     meshes = added(NONE, "it", load_mesh(path, 0.001 if form == "obj" else 1.0, False, "here"))
     X = about(s, 300, np.random.default_rng(12))

@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtctl.errors import LinkError
-from rtctl.hal.can import CanLink, LinkSpec, identifiers
-from rtctl.hal.mmsg import CAPACITY, Messages
-from rtctl.hal.transport import InProcess, Seqpacket, open_transport, socket_path
+from rtctl.hal.can.datagrams import CAPACITY, Messages
+from rtctl.hal.can.link import CanLink, LinkSpec, identifiers
+from rtctl.hal.can.transport import InProcess, Seqpacket, open_transport, socket_path
 from rtctl.protocol import e2e, frame, mit
 from rtctl.types import Command, Drive, Feedback, Link, Transport
 from tests.fake_drives import PERIOD, PROTOCOLS, FakeDrives, spec_of
@@ -603,7 +603,7 @@ class Sick:
     [(can.BusState.ERROR, Link.BUS_OFF), (can.BusState.PASSIVE, Link.ERROR_PASSIVE), (can.BusState.ACTIVE, Link.NONE)],
 )
 def test_an_adapter_that_fails_is_reported_in_flags(state: can.BusState, flag: Link) -> None:
-    from rtctl.hal.transport import PythonCan
+    from rtctl.hal.can.transport import PythonCan
 
     transport: Transport = PythonCan(Sick(state))  # type: ignore[arg-type]
     assert transport.send_all(numbered(2)) == []

@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from rtctl import config as cfg
-from rtctl import replay as module
-from rtctl.control.escape import Escape, Phase
-from rtctl.control.memory import Memory
-from rtctl.control.pipe import tick
+from rtctl import design as cfg
+from rtctl.app import replay as module
+from rtctl.app.replay import Replay, replay
+from rtctl.arm.escape import Escape, Phase
+from rtctl.arm.memory import Memory
+from rtctl.arm.pipe import tick
 from rtctl.errors import LogError
-from rtctl.log import checkpoint
-from rtctl.log.checkpoint import decode_checkpoint, encode_checkpoint
-from rtctl.log.run import read_run
-from rtctl.replay import Replay, replay
+from rtctl.log.read.run import read_run
+from rtctl.log.record import checkpoint
+from rtctl.log.record.checkpoint import decode_checkpoint, encode_checkpoint
 from rtctl.types import Goal, ObstacleEdit, Request, Shape, State, Task
 from tests.arms import PANDA_HOME
 from tests.lab import PANDA, ROOT, Standing, at_rest, goal, healthy, recorded, robot, same, seen, sphere

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtctl.arm.record import record_dtype
+from rtctl.arm.task import names
 from rtctl.cli import build_parser, main, values
-from rtctl.control.record import record_dtype
-from rtctl.control.task import names
 from rtctl.errors import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, EXIT_USAGE, UsageError
 from rtctl.hal import doctor
 from rtctl.hal.console import Console

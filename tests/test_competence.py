@@ -9,9 +9,10 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rtctl.control.competence import Balance, at_edge, held
-from rtctl.control.escape import Phase
-from rtctl.control.own import Hull, hulls_of
+from rtctl.arm.diagnosis import Balance, at_edge, held
+from rtctl.arm.escape import Phase
+from rtctl.arm.self_collision import Hull
+from rtctl.design.pairs import hulls_of
 from rtctl.types import F64, Status
 from tests.arms import panda, states
 from tests.lab import PANDA, Run, changed, play, robot

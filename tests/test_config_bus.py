@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from rtctl.config.bus import classic_bits, cycle_load, fd_bits, frame_time
+from rtctl.spec.bus import classic_bits, cycle_load, fd_bits, frame_time
 
 
 def stuffed(bits: list[int]) -> int:

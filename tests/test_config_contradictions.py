@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl import config
-from rtctl.control import points
-from rtctl.control.robot import Robot
+from rtctl import design
+from rtctl.arm.robot import Robot
+from rtctl.design import points
 from rtctl.errors import ConfigError
 from tests.config_leaves import replaced, write
 
@@ -109,7 +109,7 @@ def names(cases: list[Any]) -> list[str]:
 
 @pytest.fixture(scope="module")
 def panda() -> Robot:
-    return config.build(config.load(PANDA), PANDA)
+    return design.build(design.load(PANDA), PANDA)
 
 
 @pytest.mark.parametrize(("edits", "place", "reason"), FILE, ids=names(FILE))
@@ -118,7 +118,7 @@ def test_a_contradiction_within_the_file_is_refused(
 ) -> None:
     file = write(tmp_path / "panda.toml", edited(*edits))
     with pytest.raises(ConfigError) as caught:
-        config.load(file)
+        design.load(file)
     assert (caught.value.place, caught.value.exit_code) == (f"{file}: {place}", 78)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -129,9 +129,9 @@ def test_a_contradiction_with_the_urdf_is_refused(
     edits: list[tuple[str, Any]], place: str, reason: str, tmp_path: Path
 ) -> None:
     file = write(tmp_path / "panda.toml", edited(*edits))
-    loaded = config.load(file)
+    loaded = design.load(file)
     with pytest.raises(ConfigError) as caught:
-        config.build(loaded, file)
+        design.build(loaded, file)
     assert (caught.value.place, caught.value.exit_code) == (f"{file}: {place}", 78)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -140,7 +140,7 @@ def test_a_contradiction_with_the_urdf_is_refused(
 def test_the_shipped_panda_is_accepted_and_its_figures_are_the_published_ones(panda: Robot) -> None:
     assert panda.n == 7
     assert panda.avoid.eta == pytest.approx(1.56e-4, rel=2e-3)
-    rows = {row.name: row for row in config.check(config.load(PANDA), panda).rows}
+    rows = {row.name: row for row in design.check(design.load(PANDA), panda).rows}
     assert rows["obstacle push at clearance"].value == pytest.approx(15.6, rel=2e-3)
     assert rows["bus load"].value == pytest.approx(74.4, abs=0.05)
     assert rows["deceleration ramp"].value == pytest.approx(0.0707, rel=1e-3)
@@ -167,7 +167,7 @@ def test_the_base_pose_moves_the_arm_and_what_it_reaches(panda: Robot, tmp_path:
     moved = edited(("robot.base_pose", {"position_m": [1.0, 2.0, 3.0], "rpy_rad": [0.0, 0.0, np.pi / 2]}))
     moved["robot"]["urdf"] = TABLE["robot"]["urdf"]
     file = write(tmp_path / "panda.toml", moved)
-    robot = config.build(config.load(file), file)
+    robot = design.build(design.load(file), file)
     here = panda.body.evaluate(panda.home, np.zeros(7), panda.points).x
     there = robot.body.evaluate(robot.home, np.zeros(7), robot.points).x
     assert there == pytest.approx([1.0 - here[1], 2.0 + here[0], 3.0 + here[2]], abs=1e-9)
@@ -180,7 +180,7 @@ def test_the_paper_s_rates_are_accepted(tmp_path: Path) -> None:
         ("safety.stale_hold_ms", 13.4), ("safety.stale_stop_ms", 45.0),
     )  # fmt: skip
     file = write(tmp_path / "panda.toml", slow)
-    robot = config.build(config.load(file), file)
+    robot = design.build(design.load(file), file)
     assert (robot.safety.stale_periods, robot.safety.lost_periods) == (3, 10)
     assert robot.model_dt / robot.dt == pytest.approx(2.25)
 
@@ -188,11 +188,11 @@ def test_the_paper_s_rates_are_accepted(tmp_path: Path) -> None:
 def test_given_points_replace_the_automatic_ones_and_self_collision_can_be_switched_off(tmp_path: Path) -> None:
     given = [{"link": "panda_link4", "position_m": [0.0, 0.0, 0.0], "radius_m": 0.1}]
     file = write(tmp_path / "panda.toml", edited(("avoid.points", given), ("avoid.self_collision", False)))
-    loaded = config.load(file)
-    robot = config.build(loaded, file)
+    loaded = design.load(file)
+    robot = design.build(loaded, file)
     assert robot.points.names == ("panda_link4",)
     assert len(robot.own.pairs) == 0
-    warned = {row.name for row in config.check(loaded, robot).rows if row.verdict == "warn"}
+    warned = {row.name for row in design.check(loaded, robot).rows if row.verdict == "warn"}
     assert {"points cover", "self-collision pairs"} <= warned
 
 
@@ -202,11 +202,11 @@ def test_links_that_protrude_from_their_automatic_points_beyond_the_clearance_ar
     few = [("panda_link4", np.zeros(3), 0.05)]
     monkeypatch.setattr(points, "place", lambda body: points.given(body, few))
     with pytest.raises(ConfigError, match=r"avoid\.clearance_m: got 0\.02, wanted more than the .* protrude"):
-        config.build(config.load(PANDA), PANDA)
+        design.build(design.load(PANDA), PANDA)
 
 
 def test_the_report_is_a_table_and_json(panda: Robot) -> None:
-    report = config.check(config.load(PANDA), panda)
+    report = design.check(design.load(PANDA), panda)
     text = report.render()
     for row in report.as_dict()["rows"]:
         assert row["name"] in text

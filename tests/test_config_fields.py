@@ -15,15 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from rtctl import config
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario, load_scenario
+from rtctl import design
 from rtctl.errors import EXIT_CONFIG, ConfigError
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario, load_scenario
 from tests.config_leaves import Leaf, alternatives, broken, dotted, leaves, replaced, specimen, write
 
 Load = Callable[[Path], Any]
 KINDS: tuple[tuple[str, Any, Load], ...] = (
-    ("config", config.Config, config.load),
+    ("config", design.Config, design.load),
     ("scenario", Scenario, load_scenario),
 )
 
@@ -76,8 +76,8 @@ def test_each_field_broken_in_each_way_is_refused_by_name(
 
 
 def test_an_unknown_key_is_answered_with_the_nearest_valid_name(tmp_path: Path) -> None:
-    document = specimen(inspect.type_info(config.Config))
-    error = refusal(config.load, tmp_path / "r.toml", replaced(document, ("motion", "vmax_m_s"), 0.5))
+    document = specimen(inspect.type_info(design.Config))
+    error = refusal(design.load, tmp_path / "r.toml", replaced(document, ("motion", "vmax_m_s"), 0.5))
     assert error.wanted.startswith("v_max_m_s")
     assert difflib.SequenceMatcher(None, "vmax_m_s", error.wanted.split()[0]).ratio() > 0.8
 
@@ -129,7 +129,7 @@ def test_a_file_that_is_no_config_is_refused_with_its_place(
     file = tmp_path / "bad.toml"
     file.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
-        config.load(file)
+        design.load(file)
     assert str(caught.value).startswith(str(file))
     assert place in caught.value.place
     assert got in str(caught.value.got)
@@ -139,7 +139,7 @@ def test_a_file_that_is_no_config_is_refused_with_its_place(
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "absent.toml", tmp_path):
         with pytest.raises(ConfigError, match="wanted a readable TOML file"):
-            config.load(path)
+            design.load(path)
 
 
 @pytest.mark.parametrize(
@@ -153,8 +153,8 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_name_that_no_drive_can_have_is_refused(table: dict[str, Any], place: str, got: str, tmp_path: Path) -> None:
-    document = {**specimen(inspect.type_info(config.Config)), "drives": table}
-    error = refusal(config.load, tmp_path / "robot.toml", document)
+    document = {**specimen(inspect.type_info(design.Config)), "drives": table}
+    error = refusal(design.load, tmp_path / "robot.toml", document)
     assert (error.place, error.got) == (f"{tmp_path / 'robot.toml'}: {place}", got)
 
 
@@ -163,17 +163,17 @@ JUNK = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
     max_leaves=6,
 )
-PLACES = [leaf.path for leaf in leaves(inspect.type_info(config.Config), specimen(inspect.type_info(config.Config)))]
+PLACES = [leaf.path for leaf in leaves(inspect.type_info(design.Config), specimen(inspect.type_info(design.Config)))]
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from(PLACES), st.text(max_size=12) | st.none(), JUNK)
 def test_whatever_stands_in_a_table_the_answer_is_a_struct_or_one_line(path: Any, name: str | None, junk: Any) -> None:
     where = path if name is None or (path and isinstance(path[-1], int)) else (*path[:-1], name)
-    document = replaced(specimen(inspect.type_info(config.Config)), where, junk)
+    document = replaced(specimen(inspect.type_info(design.Config)), where, junk)
     refused = None
     try:
-        convert(document, config.Config, "robot.toml")
+        convert(document, design.Config, "robot.toml")
     except ConfigError as error:
         refused = error
     assert refused is None or ("\n" not in str(refused) and refused.place.startswith("robot.toml"))
@@ -181,4 +181,4 @@ def test_whatever_stands_in_a_table_the_answer_is_a_struct_or_one_line(path: Any
 
 def test_the_schema_shipped_for_editors_is_the_one_of_the_structs() -> None:
     shipped = Path(__file__).parents[1] / "configs" / "schema.json"
-    assert json.loads(shipped.read_text()) == config.json_schema()
+    assert json.loads(shipped.read_text()) == design.json_schema()

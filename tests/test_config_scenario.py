@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rtctl import config
-from rtctl.config.obstacles import orientation_of, pose_at, quaternion, shape_of
-from rtctl.config.scenario import (
-    GoalTable,
-    goal_of,
-    load_scenario,
-    parse_goal,
-    parse_obstacle,
-    robot_file,
-    scenario_dict,
-)
-from rtctl.control.primitives import TYPES, distance
+from rtctl import design
 from rtctl.errors import ConfigError
+from rtctl.spec.obstacles import orientation_of, pose_at, quaternion, shape_of
+from rtctl.spec.scenario import GoalTable, goal_of, load_scenario, parse_goal, parse_obstacle, robot_file, scenario_dict
 from rtctl.types import Task
+from rtctl.world.primitives import TYPES, distance
 from tests.config_leaves import write
 
 AT = {"name": "o", "position_m": [1.0, 2.0, 3.0]}
@@ -176,7 +168,7 @@ def test_a_scenario_that_contradicts_itself_is_refused_by_name(
 
 
 def test_a_goal_constrains_what_it_names() -> None:
-    loaded = config.load(Path(__file__).parents[1] / "configs" / "panda.toml")
+    loaded = design.load(Path(__file__).parents[1] / "configs" / "panda.toml")
     now = np.array([0.0, 1.0, 0.0, 0.0])
 
     def goal(**keys: Any) -> tuple[Task, list[float], float]:

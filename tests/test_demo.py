@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from rtctl.config.scenario import load_scenario
-from rtctl.control.so3 import R_of
+from rtctl.kernel.rotations import R_of
 from rtctl.log import read
+from rtctl.spec.scenario import load_scenario
 from rtctl.types import F64, Goal, Shape, State, Task
 from tests.arms import NO_POINTS, panda
 from tests.rig import ROOT, config_at

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.control import faults
-from rtctl.servo import Turn
+from rtctl.app.servo import Turn
+from rtctl.arm import faults
 from rtctl.types import F64, Link, Request, State, Verb
 from tests.lab import DOWN, Standing, goal, lab, robot
 

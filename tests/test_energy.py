@@ -10,10 +10,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from rtctl.control.field import field, field_buffers
+from rtctl.arm.field import field, field_buffers
 from rtctl.control.firas import FieldParams
-from rtctl.control.primitives import Obstacles, obstacles_empty, with_shape
 from rtctl.types import Shape
+from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 from tests.lab import robot
 
 CREATED = 0.02

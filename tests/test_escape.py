@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from rtctl.control import escape
-from rtctl.control.escape import Escape, Phase
+from rtctl.arm import escape
+from rtctl.arm.escape import Escape, Phase
+from rtctl.arm.model import Model
+from rtctl.arm.osc import MotionParams, approach_speed
 from rtctl.control.firas import field_params, firas
-from rtctl.control.model import Model
-from rtctl.control.osc import MotionParams, approach_speed
-from rtctl.control.primitives import Obstacles, distances, obstacles_empty, with_shape
 from rtctl.types import F64, Goal, Shape, Task
+from rtctl.world.primitives import Obstacles, distances, obstacles_empty, with_shape
 
 DT = 1e-3
 EYE = np.eye(3)

@@ -13,22 +13,20 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from rtctl.control.estimator import (
+from rtctl.arm.estimator import (
     Design,
     EstimatorParams,
     JointEstimate,
     JointParams,
     TipEstimate,
-    design,
-    design_joint,
     joint_start,
     joint_step,
     predict,
     start,
-    tip_params,
     update_pose,
     update_velocity,
 )
+from rtctl.design.filters import design, design_joint, tip_params
 from rtctl.types import F64
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rtctl.control import faults
-from rtctl.control.faults import BIT, FAULTS, GOOD_TICKS, INDEX, describe, latch
+from rtctl.arm import faults
+from rtctl.arm.faults import BIT, FAULTS, INDEX, describe, latch
+from rtctl.control.faults import GOOD_TICKS, Fault
 from rtctl.types import Command, Drive, Link, ObstacleEdit, Request, Severity, State, Verb
 from tests.arms import PANDA_HOME
 from tests.lab import Standing as Arm
@@ -414,7 +415,7 @@ def test_a_description_names_fault_joint_and_code():
 
 
 @pytest.mark.parametrize("each", FAULTS, ids=lambda f: f.name)
-def test_latching_keeps_what_an_operator_must_clear(each: faults.Fault):
+def test_latching_keeps_what_an_operator_must_clear(each: Fault):
     bit = BIT[each.name]
     in_force, good = latch(bit, 0, np.full(len(FAULTS), 1 << 30))
     assert in_force == bit

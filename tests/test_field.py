@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from rtctl.control.field import (
+from rtctl.arm.field import (
     CAPPED,
     CONTACT,
     Field,
@@ -26,8 +26,8 @@ from rtctl.control.field import (
     own_field,
     rho_num_of,
 )
-from rtctl.control.primitives import Obstacles, advance, distances, obstacles_empty, with_shape
 from rtctl.types import F64, I64, Shape
+from rtctl.world.primitives import Obstacles, advance, distances, obstacles_empty, with_shape
 
 V, RHO0, RHO_MIN, DT = 0.5, 0.1, 0.02, 1e-3
 UNDAMPED = field_params(V, RHO0, RHO_MIN, DT, 0.0, 0.0, 50.0)

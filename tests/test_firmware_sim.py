@@ -622,8 +622,8 @@ def test_camera_tells_where_things_are_now_and_what_is_gone(tmp_path: Path) -> N
 def test_every_obstacle_type_is_told_as_the_controller_reads_it() -> None:
     from firmware_sim.camera import seen
     from firmware_sim.shapes import shape_at, solid
-    from rtctl.config.obstacles import shape_of
-    from rtctl.config.scenario import parse_obstacle
+    from rtctl.spec.obstacles import shape_of
+    from rtctl.spec.scenario import parse_obstacle
 
     at = {"position_m": [0.1, 0.2, 0.3], "rpy_rad": [0.2, -0.4, 1.0], "velocity_m_s": [0.1, 0.0, 0.0], "name": "it"}
     tables: list[dict[str, Any]] = [

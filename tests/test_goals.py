@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.control.goals import Progress, arrived, at_rest, idle, refusal, time_left
+from rtctl.arm.progress import Progress, arrived, at_rest, idle, refusal, time_left
 from rtctl.types import Goal, Task
 
 FAR = np.full(3, np.inf)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rtctl.errors import EXIT_CONFIG, HandshakeError
-from rtctl.hal.can import CanLink, LinkSpec
-from rtctl.hal.handshake import check_interface
-from rtctl.hal.transport import InProcess
+from rtctl.hal.can.handshake import check_interface, handshake
+from rtctl.hal.can.link import CanLink, LinkSpec
+from rtctl.hal.can.transport import InProcess
 from rtctl.protocol import frame, mit
 from rtctl.types import Command, Drive, Link
 from tests.fake_drives import PERIOD, PROTOCOLS, TIMEOUT_COUNTS, FakeDrives, spec_of
@@ -30,7 +30,7 @@ def spec(request: pytest.FixtureRequest) -> LinkSpec:
 
 def refused(drives: FakeDrives, spec: LinkSpec, recover: bool = False) -> HandshakeError:
     with pytest.raises(HandshakeError) as caught:
-        link_to(drives, spec).handshake(listen=0.0, timeout=0.01, recover=recover)
+        handshake(link_to(drives, spec), listen=0.0, timeout=0.01, recover=recover)
     assert caught.value.exit_code == EXIT_CONFIG
     assert "\n" not in str(caught.value)
     return caught.value
@@ -39,7 +39,7 @@ def refused(drives: FakeDrives, spec: LinkSpec, recover: bool = False) -> Handsh
 def test_healthy_drives_are_greeted_without_one_frame_that_enables_or_writes(spec: LinkSpec) -> None:
     drives = FakeDrives(spec)
     drives.codes = [(0x8000 + 1000 * j, 0x800, 0x800) for j in range(N)]
-    greeting = link_to(drives, spec).handshake(listen=0.0)
+    greeting = handshake(link_to(drives, spec), listen=0.0)
     np.testing.assert_allclose(greeting.q, [1000 * j * 25 / 65535 for j in range(N)], atol=25 / 65535)
     assert greeting.watchdogs_written == ()
     assert drives.written == []
@@ -51,7 +51,7 @@ def test_healthy_drives_are_greeted_without_one_frame_that_enables_or_writes(spe
 
 def test_the_first_cycle_after_it_is_a_healthy_one(spec: LinkSpec) -> None:
     link = link_to(FakeDrives(spec), spec)
-    link.handshake(listen=0.0)
+    handshake(link, listen=0.0)
     for slot in range(40, 43):
         feedback = link.read(slot, 0, 0.0, 0.0)
         assert Link(feedback.link) == Link.NONE
@@ -68,7 +68,7 @@ def test_it_may_be_repeated_in_the_middle_of_a_session(spec: LinkSpec) -> None:
         link.write(Command(Drive.TORQUE, np.zeros(N)))
     drives.counters = [200] * N  # rebooted meanwhile
     link.bus_state = Link.BUS_OFF
-    link.handshake(listen=0.0)
+    handshake(link, listen=0.0)
     feedback = link.read(500, 0, 0.0, 0.0)
     assert Link(feedback.link) == Link.NONE
     assert feedback.replies.tolist() == [1] * N
@@ -83,7 +83,7 @@ def test_a_lost_reply_is_asked_for_again(spec: LinkSpec) -> None:
         return [] if calls[0] % 5 == 0 else [raw]
 
     drives.mischief = lose_every_fifth
-    assert len(link_to(drives, spec).handshake(listen=0.0, timeout=0.01).q) == N
+    assert len(handshake(link_to(drives, spec), listen=0.0, timeout=0.01).q) == N
 
 
 def test_a_late_answer_of_the_other_kind_is_not_mistaken(spec: LinkSpec) -> None:
@@ -96,7 +96,7 @@ def test_a_late_answer_of_the_other_kind_is_not_mistaken(spec: LinkSpec) -> None
         return [before] if before else []
 
     drives.mischief = late
-    greeting = link_to(drives, spec).handshake(listen=0.0, timeout=0.01)
+    greeting = handshake(link_to(drives, spec), listen=0.0, timeout=0.01)
     np.testing.assert_allclose(greeting.q, 0.0, atol=25 / 65535)
 
 
@@ -143,7 +143,7 @@ def test_a_scale_is_compared_as_the_drive_holds_it() -> None:
     drives = FakeDrives(spec)
     for registers in drives.registers:
         registers |= {21: 12.3, 22: 45.1, 23: 54.7}
-    assert link_to(drives, spec).handshake(listen=0.0).watchdogs_written == ()
+    assert handshake(link_to(drives, spec), listen=0.0).watchdogs_written == ()
 
 
 def test_a_register_that_is_not_answered(spec: LinkSpec) -> None:
@@ -158,11 +158,11 @@ def test_a_register_that_is_not_answered(spec: LinkSpec) -> None:
 def test_a_watchdog_is_written_only_where_it_differs_and_read_back(spec: LinkSpec, counts: int) -> None:
     drives = FakeDrives(spec)
     drives.registers[1][mit.TIMEOUT] = counts
-    greeting = link_to(drives, spec).handshake(listen=0.0)
+    greeting = handshake(link_to(drives, spec), listen=0.0)
     assert greeting.watchdogs_written == ("joint2",)
     assert drives.written == [(1, mit.TIMEOUT)]
     assert drives.registers[1][mit.TIMEOUT] == TIMEOUT_COUNTS
-    assert link_to(drives, spec).handshake(listen=0.0).watchdogs_written == ()
+    assert handshake(link_to(drives, spec), listen=0.0).watchdogs_written == ()
 
 
 def test_a_watchdog_that_does_not_take_what_is_written(spec: LinkSpec) -> None:
@@ -189,7 +189,7 @@ def test_a_joint_outside_its_limits_unless_recovering_was_asked_for(spec: LinkSp
     assert error.place == "can0: joint joint3 (id 3): position"
     assert error.got == f"{side * 3.1252:.4f} rad"
     assert "recover" in error.wanted
-    assert link_to(drives, spec).handshake(listen=0.0, recover=True).q[2] == pytest.approx(side * 8192.5 * 25 / 65535)
+    assert handshake(link_to(drives, spec), listen=0.0, recover=True).q[2] == pytest.approx(side * 8192.5 * 25 / 65535)
 
 
 def test_drives_that_answer_in_classic_frames_where_fd_was_promised() -> None:
@@ -240,7 +240,7 @@ def test_a_second_master_heard_while_listening(can_id: int) -> None:
     transport = InProcess(lambda frames: waiting)
     transport.send(b"")
     with pytest.raises(HandshakeError, match=f"can0: got somebody else's frame on id {can_id:#x}, wanted one master"):
-        CanLink(spec, transport).handshake(listen=0.01)
+        handshake(CanLink(spec, transport), listen=0.01)
 
 
 def test_a_second_master_heard_in_the_middle(spec: LinkSpec) -> None:
@@ -256,7 +256,7 @@ def test_what_was_on_its_way_before_is_not_taken_for_an_answer() -> None:
     link = link_to(drives, spec)
     link.pending = [frame.pack(0x11, struct.pack(">BHI", 1, 0x8000, 0) + b"\0")]
     with pytest.raises(HandshakeError, match=r"joint1 \(id 1\): got no answer"):
-        link.handshake(listen=0.0, timeout=0.01)
+        handshake(link, listen=0.0, timeout=0.01)
 
 
 @pytest.fixture

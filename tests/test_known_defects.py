@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.control import law as law_module
-from rtctl.control import limits, osc, primitives, session, supervisor
+from rtctl.arm import law as law_module
+from rtctl.arm import limits, osc, session
+from rtctl.arm.model import Model
+from rtctl.arm.osc import OperationalSpace
+from rtctl.control import supervisor
 from rtctl.control.firas import field_buffers
-from rtctl.control.model import Model
-from rtctl.control.osc import OperationalSpace
-from rtctl.control.primitives import obstacles_empty, with_shape
 from rtctl.control.supervisor import Event
 from rtctl.types import F64, Drive, Request, Shape, State, Verb
+from rtctl.world import primitives
+from rtctl.world.primitives import obstacles_empty, with_shape
 from tests.arms import PANDA_HOME
 from tests.lab import lab, play, robot, sphere
 

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from rtctl.control.arm_field import own_field
-from rtctl.control.guards import SPEED_BAND, SPEED_HORIZON, approach_rows, fitting, guard, joint_bounds, tip_row
-from rtctl.control.law import Law, evaluate_law, moved_points
-from rtctl.control.model import Model
-from rtctl.control.osc import operational_space
-from rtctl.control.primitives import Obstacles, obstacles_empty, with_shape
+from rtctl.arm.guards import SPEED_BAND, SPEED_HORIZON, approach_rows, fitting, guard, joint_bounds, tip_row
+from rtctl.arm.joint_field import own_field
+from rtctl.arm.law import Law, evaluate_law, moved_points
+from rtctl.arm.model import Model
+from rtctl.arm.osc import operational_space
 from rtctl.types import F64, Shape
+from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 from tests.arms import PANDA, PANDA_HOME, PANDA_JOINTS, Bullet, states
 from tests.lab import robot, sphere
 

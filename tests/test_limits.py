@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rtctl.control.limits import permit, slew_reference
+from rtctl.arm.limits import permit, slew_reference
 from rtctl.types import Cut
 
 N, DT = 3, 1e-3

@@ -16,10 +16,10 @@ from mcap.writer import CompressionType, Writer
 
 from rtctl.errors import LogError
 from rtctl.log import Header, Kind, McapSink, make_header, read
-from rtctl.log.info import info
-from rtctl.log.recover import recover
-from rtctl.log.replay import inputs
-from rtctl.log.request import encode_event, encode_request
+from rtctl.log.mcap.recovery import recover
+from rtctl.log.read.info import info
+from rtctl.log.read.inputs import inputs
+from rtctl.log.record.requests import encode_event, encode_request
 from rtctl.types import Goal, ObstacleEdit, Request, Shape, Task, Verb
 
 N, SLOTS = 3, 4

@@ -22,18 +22,19 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 from rosbags.typesys import Stores, get_typestore
 
-from rtctl import compare
-from rtctl import config as cfg
+from rtctl import design as cfg
+from rtctl.app import compare
+from rtctl.app.replay import rebuilt, replay
+from rtctl.app.sim import simulate
+from rtctl.arm.record import record_dtype
 from rtctl.cli import main
-from rtctl.control.record import record_dtype
 from rtctl.errors import LogError
-from rtctl.log import Kind, McapSink, make_header, mesh, read
-from rtctl.log.fields import FIELDS
-from rtctl.log.info import info
-from rtctl.log.run import read_run
-from rtctl.log.segment import begin
-from rtctl.replay import rebuilt, replay
-from rtctl.sim import simulate
+from rtctl.log import Kind, McapSink, make_header, read
+from rtctl.log.mcap.segment import begin
+from rtctl.log.read.fields import FIELDS
+from rtctl.log.read.info import info
+from rtctl.log.read.run import read_run
+from rtctl.log.record import meshes
 from tests.arms import panda
 from tests.lab import PANDA, ROOT, recorded, robot
 from tools import crash, golden
@@ -88,7 +89,7 @@ def test_a_log_replays_to_the_bit_and_to_the_digest_of_its_run(log: Path):
 
 def test_a_log_alone_is_enough_without_the_packages_of_its_meshes(log: Path, monkeypatch: pytest.MonkeyPatch):
     shutil.copy(log, log.with_name("alone.mcap"))
-    monkeypatch.setattr("rtctl.config.urdf.share_folders", list)
+    monkeypatch.setattr("rtctl.spec.urdf.share_folders", list)
     _, arm = rebuilt(read_run(log.with_name("alone.mcap")))
     assert arm.points.local.tobytes() == robot().points.local.tobytes()
     assert arm.constants.tobytes() == robot().constants.tobytes()
@@ -101,7 +102,7 @@ def test_the_control_law_has_not_changed_a_bit(name: str):
 
 
 def test_a_changed_bit_is_reported_as_tick_joint_field_and_size(log: Path, monkeypatch: pytest.MonkeyPatch):
-    from rtctl import replay as module
+    from rtctl.app import replay as module
 
     def nudged(arm: Any, memory: Any, feedback: Any, request: Any) -> Any:
         memory, command, record = law_tick(arm, memory, feedback, request)
@@ -125,7 +126,7 @@ def test_a_changed_bit_is_reported_as_tick_joint_field_and_size(log: Path, monke
 
 
 def test_a_changed_command_byte_is_found_on_the_wire(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from rtctl import replay as module
+    from rtctl.app import replay as module
 
     monkeypatch.setattr(module, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
     run = read_run(log)
@@ -208,17 +209,17 @@ def test_meshes_of_urdf_and_config_travel_with_the_log(tmp_path: Path):
         (tmp_path / name).write_bytes(name.encode() * 100)
     urdf = '<robot><link name="a"><collision><geometry><mesh filename="arm.stl"/></geometry></collision></link></robot>'
     config = '[[mesh]]\nname = "rock"\nfile = "rock.obj"\n'
-    packed = mesh.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)
-    assert packed == mesh.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)  # equal logs, equal bytes
+    packed = meshes.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)
+    assert packed == meshes.archive(urdf, tmp_path, (), ("rock.obj",), tmp_path)  # equal logs, equal bytes
     there = tmp_path / "there"
     there.mkdir()
-    new_urdf, new_config = mesh.unpacked(urdf, config, {mesh.MESHES: packed}, there)
+    new_urdf, new_config = meshes.unpacked(urdf, config, {meshes.MESHES: packed}, there)
     for text, name in ((new_urdf, "arm.stl"), (new_config, "rock.obj")):
         (place,) = re.findall(r'"([^"]+there[^"]+)"', text)
         assert Path(place).read_bytes() == (tmp_path / name).read_bytes()
     with pytest.raises(LogError, match=r"meshes\.zip"):
-        mesh.unpacked(urdf, config, {mesh.MESHES: packed[:-30]}, there)
-    assert mesh.archive(urdf.replace("arm", "none"), tmp_path, ()) == b""  # what is not there cannot be attached
+        meshes.unpacked(urdf, config, {meshes.MESHES: packed[:-30]}, there)
+    assert meshes.archive(urdf.replace("arm", "none"), tmp_path, ()) == b""  # what is not there cannot be attached
 
 
 # ---- arrays

@@ -12,10 +12,10 @@ import pinocchio
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rtctl.config.urdf import package_folders
-from rtctl.control.model import Model, RigidBody, spd_inverse
-from rtctl.control.points import Points
+from rtctl.arm.model import Model, RigidBody, spd_inverse
+from rtctl.arm.points import Points
 from rtctl.errors import ConfigError
+from rtctl.spec.urdf import package_folders
 from rtctl.types import F64
 from tests.arms import (
     CROOKED,

@@ -14,23 +14,23 @@ from hypothesis import strategies as st
 
 from firmware_sim import camera as simulated
 from firmware_sim.simulator import open_simulator
-from rtctl import config as cfg
+from rtctl import design as cfg
+from rtctl.app.servo import first_feedback
+from rtctl.app.sim import simulate
+from rtctl.arm.pipe import initial, tick
 from rtctl.cli import main
-from rtctl.config.scenario import load_scenario
-from rtctl.control import world
-from rtctl.control.pipe import initial, tick
-from rtctl.control.primitives import CLOUD_POINTS
 from rtctl.errors import ConfigError, RequestError
 from rtctl.hal import client, messages
 from rtctl.hal.console import BYTES_PER_SLOT, Console
 from rtctl.hal.messages import Bounds, Notice, cloud_message
 from rtctl.log.header import meshes_of
-from rtctl.log.reader import read
-from rtctl.log.replay import inputs
-from rtctl.log.request import decode_request, encode_request
-from rtctl.servo import first_feedback
-from rtctl.sim import simulate
+from rtctl.log.read.inputs import inputs
+from rtctl.log.read.reader import read
+from rtctl.log.record.requests import decode_request, encode_request
+from rtctl.spec.scenario import load_scenario
 from rtctl.types import ObstacleEdit, Request, Shape, State
+from rtctl.world import obstacle_table
+from rtctl.world.primitives import CLOUD_POINTS
 from tests.bodies import SURFACES, box, cloud_shape, known, mesh_shape, torus, write_obj, write_stl
 from tests.lab import PANDA, PANDA_HOME, Standing, changed, robot, sphere
 
@@ -38,8 +38,8 @@ ORIGIN = np.zeros(3)
 BOUNDS = Bounds((0.0, 0.0, 0.3), 1.2, 0.003, 0.015)
 
 
-def put(table: world.World, *shapes: Shape, age: float = 0.0, feed: bool = False) -> world.World:
-    table, refusal = world.edited(table, tuple(ObstacleEdit(s.name, s, age, feed) for s in shapes))
+def put(table: obstacle_table.World, *shapes: Shape, age: float = 0.0, feed: bool = False) -> obstacle_table.World:
+    table, refusal = obstacle_table.edited(table, tuple(ObstacleEdit(s.name, s, age, feed) for s in shapes))
     assert refusal == ""
     return table
 
@@ -59,9 +59,9 @@ def panda(folder: Path, **tables: list[dict[str, Any]]) -> Path:
 
 def test_parts_of_a_union_share_the_number_of_its_first_and_the_others_keep_their_own() -> None:
     a, b, c, d = (sphere(name, [1.0, 0.0, 0.0], 0.1) for name in "abcd")
-    table = put(world.empty(6), a._replace(group="u"), b, c._replace(group="u"), d._replace(group="v"))
+    table = put(obstacle_table.empty(6), a._replace(group="u"), b, c._replace(group="u"), d._replace(group="v"))
     assert table.obstacles.group.tolist() == [0, 1, 0, 3, 4, 5]
-    table, _ = world.edited(table, (ObstacleEdit("a", None),))
+    table, _ = obstacle_table.edited(table, (ObstacleEdit("a", None),))
     assert table.obstacles.group.tolist() == [0, 1, 2, 3, 4, 5]  # c is the first now
     table = put(table, b._replace(group="u"), d)
     assert table.obstacles.group.tolist() == [0, 1, 1, 3, 4, 5]
@@ -112,23 +112,23 @@ def test_groups_that_contradict_themselves_are_refused_by_a_line(tmp_path: Path,
 
 
 def test_an_observation_widens_with_its_age_until_it_is_stale_and_not_beyond() -> None:
-    table = world.empty(4, creep=0.2, stale=0.5)
+    table = obstacle_table.empty(4, creep=0.2, stale=0.5)
     table = put(table, sphere("ball", [1.0, 0.0, 0.0], 0.1, (0.0, 0.1, 0.0)), sphere("crate", [0.0, 2.0, 0.0], 0.1))
     table = put(table, sphere("fed", [0.0, 0.0, 3.0], 0.1), age=0.05, feed=True)
     assert table.obstacles.margin.tolist() == pytest.approx([0.0, 0.0, 0.01, 0.0])
     for _ in range(100):
-        table = world.advanced(table, 0.001)
+        table = obstacle_table.advanced(table, 0.001)
     assert table.obstacles.margin.tolist() == pytest.approx([0.02, 0.0, 0.03, 0.0])
-    assert world.distance_from(table, ORIGIN)[2] == pytest.approx(2.9)  # where it was seen, margin or not
+    assert obstacle_table.distance_from(table, ORIGIN)[2] == pytest.approx(2.9)  # where it was seen, margin or not
     for _ in range(1000):
-        table = world.advanced(table, 0.001)
+        table = obstacle_table.advanced(table, 0.001)
     assert table.obstacles.margin.tolist() == pytest.approx([0.1, 0.0, 0.1, 0.0])
-    assert world.oldest(table) == pytest.approx(1.15)
+    assert obstacle_table.oldest(table) == pytest.approx(1.15)
     table = put(table, sphere("fed", [0.0, 0.0, 3.0], 0.1), feed=True)
     for _ in range(200):  # what is no longer needed is given back without a step
-        table = world.advanced(table, 0.001)
+        table = obstacle_table.advanced(table, 0.001)
     assert table.obstacles.margin[2] == pytest.approx(0.1 - 0.25 * 0.2 * 0.2)
-    table, _ = world.edited(table, (ObstacleEdit("fed", None),))
+    table, _ = obstacle_table.edited(table, (ObstacleEdit("fed", None),))
     assert table.obstacles.margin[2] == 0.0
 
 
@@ -209,7 +209,7 @@ def test_the_largest_cloud_is_one_message_and_reaches_the_tick(console: Console)
     message = cloud_of(CLOUD_POINTS, feed=True, age_s=0.01)
     assert len(message) <= client.MESSAGE_MAX
     assert len(message) / BYTES_PER_SLOT < 1000 / 30
-    table = world.empty(8)
+    table = obstacle_table.empty(8)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link, client.Session(console.path) as operator:
         link.setblocking(False)
         link.connect(console.path)
@@ -223,7 +223,7 @@ def test_the_largest_cloud_is_one_message_and_reaches_the_tick(console: Console)
             console.answer(True)
             verbs += request.verb != 0
             for edit in request.obstacles:
-                table, refusal = world.edited(table, (edit,))
+                table, refusal = obstacle_table.edited(table, (edit,))
                 assert refusal == ""
                 assert edit.feed
                 assert 0.01 <= edit.age < 0.02
@@ -231,7 +231,7 @@ def test_the_largest_cloud_is_one_message_and_reaches_the_tick(console: Console)
         assert (taken, verbs) == (10, 10)
     steps = np.random.default_rng(CLOUD_POINTS).integers(-3000, 3000, (CLOUD_POINTS, 3))
     points = np.array([0.5, 0.0, 0.4]) + 1e-4 * steps
-    assert world.distance_from(table, ORIGIN)[0] == pytest.approx(
+    assert obstacle_table.distance_from(table, ORIGIN)[0] == pytest.approx(
         np.linalg.norm(points, axis=1).min() - 0.01, abs=1e-12
     )
 
@@ -285,8 +285,8 @@ def test_whatever_follows_the_mark_of_a_cloud_is_taken_or_refused(noise: bytes, 
     except RequestError:
         return
     assert isinstance(frame, messages.CloudFrame)
-    table, _ = world.edited(world.empty(2), messages.request_of(frame, BOUNDS, list).obstacles)
-    assert np.isfinite(world.distance_from(table, ORIGIN)[table.obstacles.active]).all()
+    table, _ = obstacle_table.edited(obstacle_table.empty(2), messages.request_of(frame, BOUNDS, list).obstacles)
+    assert np.isfinite(obstacle_table.distance_from(table, ORIGIN)[table.obstacles.active]).all()
 
 
 @pytest.mark.parametrize(
@@ -313,11 +313,16 @@ def test_a_mesh_is_told_by_the_name_that_the_config_gave_it(tmp_path: Path) -> N
     assert arm.meshes.names == ("ell",)
     told = messages.decode(json.dumps({"verb": "obstacle", "set": {
         "type": "mesh", "name": "crate", "mesh": "ell", "position_m": [2.0, 0.0, 0.0]}}).encode())  # fmt: skip
-    table, refusal = world.edited(world.empty(4, arm.meshes), messages.request_of(told, BOUNDS, list).obstacles)
+    table, refusal = obstacle_table.edited(
+        obstacle_table.empty(4, arm.meshes), messages.request_of(told, BOUNDS, list).obstacles
+    )
     assert refusal == ""
-    assert world.distance_from(table, ORIGIN)[0] == pytest.approx(2.0 - 1.5 * 0.06, abs=1e-7)
+    assert obstacle_table.distance_from(table, ORIGIN)[0] == pytest.approx(2.0 - 1.5 * 0.06, abs=1e-7)
     ghost = ObstacleEdit("crate", mesh_shape("ghost"))
-    assert world.edited(table, (ghost,))[1] == "obstacle crate: mesh: got 'ghost', wanted one of the config's: ell"
+    assert (
+        obstacle_table.edited(table, (ghost,))[1]
+        == "obstacle crate: mesh: got 'ghost', wanted one of the config's: ell"
+    )
 
 
 @pytest.mark.parametrize(
@@ -363,11 +368,11 @@ def test_the_command_line_reads_a_clouds_file_and_sends_its_points(
     assert main(["obstacle", "set", "bin", "cloud", *words, "--socket", console.path]) == 0
     assert "points of radius" in capsys.readouterr().out
     edits = messages.request_of(messages.decode(sent[0]), BOUNDS, list).obstacles
-    table, refusal = world.edited(world.empty(2), edits)
+    table, refusal = obstacle_table.edited(obstacle_table.empty(2), edits)
     assert refusal == ""
     turned = points @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + np.array([1.0, 0.0, 0.5])
     true = float(np.linalg.norm(turned, axis=1).min() - 0.01)
-    assert true - 0.06 < world.distance_from(table, ORIGIN)[0] <= true + 1e-5
+    assert true - 0.06 < obstacle_table.distance_from(table, ORIGIN)[0] <= true + 1e-5
 
 
 # ---- log and replay
@@ -469,8 +474,8 @@ def test_the_plant_measures_a_mesh_and_a_cloud_as_the_shapes_they_stand_for(tmp_
         assert c["on"] < 0.0
         assert truth.contacts == 1
         seen = {e.name: e.shape for e in simulator.obstacles()}
-        table = put(world.empty(8, known(**{"@mesh": box(0.1, 0.05, 0.15)})), *seen.values())
-        rho = dict(zip(table.names, world.distance_from(table, ORIGIN), strict=True))
+        table = put(obstacle_table.empty(8, known(**{"@mesh": box(0.1, 0.05, 0.15)})), *seen.values())
+        rho = dict(zip(table.names, obstacle_table.distance_from(table, ORIGIN), strict=True))
         assert rho["mesh"] == pytest.approx(rho["box"], abs=1e-9)
         assert rho["cloud"] == pytest.approx(rho["ball"], abs=2e-3)
     finally:

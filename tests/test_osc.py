@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtctl.control import osc
-from rtctl.control.linalg import matmul, matvec, symmetric_eigen, tmatvec
+from rtctl.arm import osc
+from rtctl.kernel.linalg import matmul, matvec, symmetric_eigen, tmatvec
 
 RNG = np.random.default_rng(3)
 P = osc.MotionParams(200.0, 2 * np.sqrt(200.0), 0.5, 5.0, 1.5, 15.0, 10.0, 6.0, np.full(7, 20.0), 0.02, 0.2, 0.8)

@@ -7,9 +7,10 @@ import numpy as np
 import pinocchio
 import pytest
 
-from rtctl.control.field import CAPPED, CONTACT, field_params, own_field
-from rtctl.control.model import RigidBody
-from rtctl.control.own import Own, hulls_of, nothing, watched
+from rtctl.arm.field import CAPPED, CONTACT, field_params, own_field
+from rtctl.arm.model import RigidBody
+from rtctl.arm.self_collision import Own, nothing
+from rtctl.design.pairs import hulls_of, watched
 from rtctl.types import F64
 from tests.arms import NO_POINTS, PANDA_HOME, panda
 
@@ -80,7 +81,7 @@ def test_neighbours_and_links_that_never_meet_are_not_watched() -> None:
 
 
 def test_the_bounding_balls_hold_their_hulls() -> None:
-    from rtctl.control.solids import solids_of
+    from rtctl.design.solids import solids_of
 
     hulls = {h.name: h for h in hulls_of(panda())}
     for solid in solids_of(panda()):

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from msgspec.structs import astuple
 
-from rtctl import config as cfg
-from rtctl.control.memory import Memory
-from rtctl.control.pipe import initial, tick, warm
-from rtctl.control.so3 import quat_of
+from rtctl import design as cfg
+from rtctl.app.servo import first_feedback
+from rtctl.app.sim import simulate
+from rtctl.arm.memory import Memory
+from rtctl.arm.pipe import initial, tick, warm
 from rtctl.hal.clock import lockstep
 from rtctl.hal.messages import Bounds, decode, request_of
+from rtctl.kernel.rotations import quat_of
 from rtctl.log import read, segments
-from rtctl.log.replay import inputs
-from rtctl.servo import first_feedback
-from rtctl.sim import simulate
+from rtctl.log.read.inputs import inputs
 from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Record, Request, State, Task, Verb
 from tests.arms import PANDA_HOME
 from tests.bodies import cloud_shape
@@ -121,7 +121,7 @@ def test_warming_compiles_all_that_a_run_needs():
     kernels = {
         f"{module}.{name}": thing
         for module in sorted(sys.modules)
-        if module.startswith("rtctl.control.") and not module.startswith("rtctl.control.base")
+        if module.startswith(("rtctl.kernel.", "rtctl.world.", "rtctl.control.", "rtctl.arm."))
         for name, thing in vars(sys.modules[module]).items()
         if hasattr(thing, "signatures")
     }

@@ -11,24 +11,24 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from rtctl import config as cfg
-from rtctl import daemon
+from rtctl import design as cfg
+from rtctl.app import daemon
+from rtctl.app.plan import plan
+from rtctl.app.stream import REPLANS, Follower, Seen
+from rtctl.arm.task import between
 from rtctl.cli import main
 from rtctl.cli.planning import message_of, obstacles_told
 from rtctl.cli.values import goal_messages
-from rtctl.config.obstacles import shape_of
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario, load_scenario, scenario_dict
-from rtctl.control import world
-from rtctl.control.own import hulls_of
-from rtctl.control.primitives import distances
-from rtctl.control.so3 import exp3, quat_of
-from rtctl.control.task import between
+from rtctl.design.pairs import hulls_of
 from rtctl.errors import PlanError, RequestError
 from rtctl.hal.messages import GoalMessage, decode
-from rtctl.planner import plan
-from rtctl.stream import REPLANS, Follower, Seen
+from rtctl.kernel.rotations import exp3, quat_of
+from rtctl.spec.obstacles import shape_of
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario, load_scenario, scenario_dict
 from rtctl.types import F64, Goal, ObstacleEdit, Shape, Task
+from rtctl.world import obstacle_table
+from rtctl.world.primitives import distances
 from tests.bodies import cloud_shape, ell, known, mesh_shape, torus
 from tests.lab import ROOT, changed, play, robot
 
@@ -48,7 +48,7 @@ def to(x: float, y: float, z: float) -> Goal:
 def test_a_planned_way_is_clear_of_everything_by_coal_and_the_same_for_the_same_seed():
     arm, scenario = robot(), load_scenario(TRAP)
     shapes = tuple(shape_of(o) for o in scenario.obstacle)
-    obstacles = world.with_static(world.empty(arm.slots), shapes).obstacles
+    obstacles = obstacle_table.with_static(obstacle_table.empty(arm.slots), shapes).obstacles
     start = np.array(scenario.start_q_rad)
     goals = plan(arm, start, to(0.53, 0.0, 0.22), obstacles, seed=3)
     again = plan(arm, start, to(0.53, 0.0, 0.22), obstacles, seed=3)
@@ -78,7 +78,7 @@ def test_an_arm_in_a_plane_is_led_around_along_the_axes_that_it_has():
     arm = cfg.build(cfg.load(file), file)
     size, at = np.array([0.12, 0.12, 0.2]), np.array([1.28, 0.68, 0.0])
     crate = Shape("crate", "box", np.array([*size, 0.0]), at, UNIT, np.zeros(3), np.zeros(3))
-    obstacles = world.with_static(world.empty(arm.slots), (crate,)).obstacles
+    obstacles = obstacle_table.with_static(obstacle_table.empty(arm.slots), (crate,)).obstacles
     goals = plan(arm, arm.home, to(1.25, 0.35, 0.3), obstacles)  # it moves at the height it has
     assert [g.task for g in goals] == [arm.axes] * (len(goals) - 1) + [Task.X | Task.Y]
     for goal in goals:
@@ -98,7 +98,7 @@ def test_a_plan_to_a_direction_ends_in_a_posture_that_points_there():
     arm, aim = robot(), np.array([0.8, 0.6, 0.0])
     turn = quat_of(exp3(between(EYE[0], aim)))
     asked = Goal(np.zeros(3), turn, Task.DIRECTION, 0.003, 0.015, EYE[0])
-    q = plan(arm, arm.home, asked, world.empty(arm.slots).obstacles)[-1].posture
+    q = plan(arm, arm.home, asked, obstacle_table.empty(arm.slots).obstacles)[-1].posture
     data = arm.body.model.createData()
     pin.framesForwardKinematics(arm.body.model, data, q)
     tip = data.oMf[arm.body.model.getFrameId("panda_hand_tcp")]
@@ -110,7 +110,7 @@ def test_the_obstacles_of_a_running_robot_come_over_as_they_are():
     arm = robot()._replace(meshes=known(other=ell(), torus=torus()))
     ball = Shape("ball", "sphere", np.array([0.1, 0, 0, 0]), EYE[1], UNIT, 0.1 * EYE[0], np.zeros(3))
     edits = (ObstacleEdit("ball", ball, 0.2, True), ObstacleEdit("ring", mesh_shape("torus", 0.4 * EYE[0])))
-    table, refusal = world.edited(world.empty(arm.slots, arm.meshes, creep=0.1), edits)
+    table, refusal = obstacle_table.edited(obstacle_table.empty(arm.slots, arm.meshes, creep=0.1), edits)
     assert not refusal
     servo: Any = SimpleNamespace(memory=SimpleNamespace(world=table))
 
@@ -125,7 +125,7 @@ def test_the_obstacles_of_a_running_robot_come_over_as_they_are():
     np.testing.assert_array_equal(rho[:2], again[:2])
     with pytest.raises(RequestError, match="ring is the mesh torus, which the config does not have"):
         obstacles_told(told(), robot())
-    table, _ = world.edited(table, (ObstacleEdit("dust", cloud_shape(P, 1e-4, 0.01, EYE[0])),))
+    table, _ = obstacle_table.edited(table, (ObstacleEdit("dust", cloud_shape(P, 1e-4, 0.01, EYE[0])),))
     servo.memory.world = table
     with pytest.raises(RequestError, match="dust is a cloud"):
         obstacles_told(told(), here)
@@ -150,13 +150,18 @@ def test_the_trap_is_reported_by_a_controller_that_is_left_alone(tmp_path):
 
 def test_what_has_no_way_is_said_so():
     arm = robot()
-    nothing = world.empty(arm.slots).obstacles
+    nothing = obstacle_table.empty(arm.slots).obstacles
     with pytest.raises(PlanError, match=r"no posture .* has the goal 0.000 0.000 2.000"):
         plan(arm, arm.home, to(0.0, 0.0, 2.0), nothing)
     table = [{"name": "slab", "type": "box", "size_m": (0.3, 0.3, 0.3), "position_m": (0.5, 0.0, 0.2)}]
     shapes = tuple(shape_of(o) for o in load_obstacles(table))
     with pytest.raises(PlanError, match="touches something"):
-        plan(arm, arm.home, to(0.5, 0.0, 0.3), world.with_static(world.empty(arm.slots), shapes).obstacles)
+        plan(
+            arm,
+            arm.home,
+            to(0.5, 0.0, 0.3),
+            obstacle_table.with_static(obstacle_table.empty(arm.slots), shapes).obstacles,
+        )
 
 
 def load_obstacles(rows: list[dict[str, Any]]) -> tuple[Any, ...]:

@@ -13,8 +13,9 @@ import numpy as np
 import pinocchio
 import pytest
 
-from rtctl.control.model import RigidBody
-from rtctl.control.points import Coverage, Points, coverage, given, place
+from rtctl.arm.model import RigidBody
+from rtctl.arm.points import Coverage, Points
+from rtctl.design.points import coverage, given, place
 from rtctl.errors import ConfigError
 from rtctl.types import F64
 from tests.arms import CROOKED, CROOKED_JOINTS, crooked, panda, states

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rtctl.control.primitives import (
+from rtctl.types import F64, Shape
+from rtctl.world.primitives import (
     N_MAX,
     TYPES,
     Obstacles,
@@ -22,7 +23,6 @@ from rtctl.control.primitives import (
     obstacles_empty,
     with_shape,
 )
-from rtctl.types import F64, Shape
 from tests.lab import without
 
 

@@ -20,12 +20,12 @@ import pytest
 from mcap.reader import make_reader
 
 from rtctl.errors import LogError
-from rtctl.hal.recorder import Recorder, rescue
 from rtctl.log import Header, Kind, make_header, read, segments
 from rtctl.log.entry import Batch
-from rtctl.log.info import info
-from rtctl.log.recover import recover_folder
-from rtctl.log.writer import Options, Session, segment_path
+from rtctl.log.mcap.recovery import recover_folder
+from rtctl.log.read.info import info
+from rtctl.log.record.recorder import Recorder, rescue
+from rtctl.log.record.writer import Options, Session, segment_path
 
 HEADER = make_header("arm", ("a", "b"), 2, 1e-3, config="x = 1\n", urdf="<robot/>")
 FRAMES = [struct.pack("=IB3x8s", 1 + i, 8, bytes(8)) for i in range(7)]
@@ -281,7 +281,7 @@ def test_a_recorder_that_cannot_write_comes_up_degraded(tmp_path: Path) -> None:
 
 
 def test_without_a_recorder_the_start_fails_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rtctl.hal.recorder.sys.executable", "/bin/false")
+    monkeypatch.setattr("rtctl.log.record.recorder.sys.executable", "/bin/false")
     with pytest.raises(LogError, match="did not start"):
         Recorder.start(tmp_path / "log", HEADER, folders=[tmp_path])
     assert not list(tmp_path.glob("*.ring"))

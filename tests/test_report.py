@@ -11,9 +11,9 @@ import pytest
 
 from rtctl.cli import main
 from rtctl.log import Kind, McapSink, make_header, read
-from rtctl.log.png import envelope
-from rtctl.log.report.bins import Bins, Histogram, Spectrum
-from rtctl.log.request import encode_event
+from rtctl.log.record.requests import encode_event
+from rtctl.log.view.plot import envelope
+from rtctl.log.view.report.bins import Bins, Histogram, Spectrum
 from tests.lab import ROOT
 from tools.browser import Browser, missing
 

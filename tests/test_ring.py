@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtctl.errors import LinkError
-from rtctl.hal import ring as rings
-from rtctl.hal.ring import Consumer, Producer, attach, create
+from rtctl.log.record import ring as rings
+from rtctl.log.record.ring import Consumer, Producer, attach, create
 
 Make = Callable[..., tuple[Producer, Consumer]]
 ALL = 1 << 30

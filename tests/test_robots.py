@@ -9,13 +9,13 @@ import pytest
 
 from firmware_sim.plant import Plant
 from firmware_sim.settings import load as load_settings
-from rtctl import config as cfg
-from rtctl.config.report import report
-from rtctl.control.mobility import mobility
-from rtctl.control.osc import operational_space
-from rtctl.control.pipe import tick
-from rtctl.control.robot import Robot
-from rtctl.control.task import selection
+from rtctl import design as cfg
+from rtctl.arm.osc import operational_space
+from rtctl.arm.pipe import tick
+from rtctl.arm.robot import Robot
+from rtctl.arm.task import selection
+from rtctl.design.mobility import mobility
+from rtctl.design.report import report
 from rtctl.errors import ConfigError
 from rtctl.types import F64, TOOL_Z, Request, State, Status, Task
 from tests.arms import NO_POINTS

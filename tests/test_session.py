@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.control import session, supervisor
-from rtctl.control.session import EVENT_OF, SETTLE
+from rtctl.arm import session
+from rtctl.arm.session import EVENT_OF, SETTLE
+from rtctl.control import supervisor
 from rtctl.types import Drive, ObstacleEdit, Request, Severity, State, Task, Verb
 from tests.arms import PANDA_HOME
 from tests.lab import Standing, goal, robot, sphere

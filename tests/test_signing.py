@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pamoja import mavlink as pamoja
 
-from rtctl.config.base import read_key
 from rtctl.errors import ConfigError
-from rtctl.hal.mavlink import dialect
-from rtctl.hal.mavlink_keys import LEASE, Keys
+from rtctl.hal.mavlink.keys import LEASE, Keys
+from rtctl.hal.mavlink.link import dialect
 from rtctl.protocol import signing
 from rtctl.protocol.signing import NOTHING, State, Verdict
+from rtctl.spec.base import read_key
 
 KEY = bytes(range(32))
 UNIX = 1_790_000_000 * 10**9  # [ns]

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl import config as cfg
-from rtctl.sim import simulate
+from rtctl import design as cfg
+from rtctl.app.sim import simulate
 from rtctl.types import F64, Cut, State, Status
 from tests.arms import PANDA_HOME
 from tests.lab import PANDA, ROOT, Run, changed, play, robot

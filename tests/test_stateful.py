@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from firmware_sim.drive import State as DriveState
 from firmware_sim.inject import KINDS, Fault
 from firmware_sim.simulator import open_simulator
-from rtctl.control.faults import FAULTS, severity, stops
+from rtctl.arm.faults import FAULTS, severity, stops
 from rtctl.protocol import frame
 from rtctl.types import Command, Drive, Goal, Link, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
 from tests.lab import PANDA, Lab, robot

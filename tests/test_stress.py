@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_sim.plant import Contact
-from rtctl.config.scenario import load_scenario, scenario_dict
+from rtctl.spec.scenario import load_scenario, scenario_dict
 from tests.lab import robot
 from tools.stress import judge
 from tools.stress.play import Seen, play, robot_of

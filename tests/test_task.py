@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rtctl.config.goal import goal_from
-from rtctl.config.scenario import GoalTable, parse_goal
-from rtctl.control import osc, task
-from rtctl.control.so3 import R_of
+from rtctl.arm import osc, task
 from rtctl.errors import ConfigError
+from rtctl.kernel.rotations import R_of
+from rtctl.spec.goal import goal_from
+from rtctl.spec.scenario import GoalTable, parse_goal
 from rtctl.types import F64, Cut, Goal, Request, Status, Task
 from tests.arms import PANDA_HOME
 from tests.lab import Run, Standing, play

@@ -14,12 +14,12 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from rtctl.control.record import record_dtype
+from rtctl.app.sim import simulate
+from rtctl.arm.record import record_dtype
 from rtctl.log import make_header, read
 from rtctl.log.header import meshes_to_files
-from rtctl.log.request import encode_request
-from rtctl.log.scene import Scene
-from rtctl.sim import simulate
+from rtctl.log.record.requests import encode_request
+from rtctl.log.record.scene import Scene
 from rtctl.types import Cut, Goal, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
 from tests.arms import panda
 from tests.base_lab import ROVER

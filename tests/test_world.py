@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rtctl.control import world
-from rtctl.control.world import World, advanced, distance_from, edited, empty, oldest, with_static
 from rtctl.types import ObstacleEdit, Shape
+from rtctl.world import obstacle_table
+from rtctl.world.obstacle_table import World, advanced, distance_from, edited, empty, oldest, with_static
 from tests.lab import leaves, same, sphere
 
 ORIGIN = np.zeros(3)
@@ -150,9 +150,9 @@ def test_the_configs_own_obstacles_are_always_there():
 
 def test_every_slot_can_be_used_and_the_last_is_seen():
     table = empty()
-    shapes = tuple(sphere(f"s{i}", [10.0 + i, 0.0, 0.0], 0.1) for i in range(world.SLOTS - 1))
+    shapes = tuple(sphere(f"s{i}", [10.0 + i, 0.0, 0.0], 0.1) for i in range(obstacle_table.SLOTS - 1))
     table = put(table, *shapes, sphere("last", [1.0, 0.0, 0.0], 0.1))
-    assert len(named(table)) == world.SLOTS
+    assert len(named(table)) == obstacle_table.SLOTS
     assert distance_from(table, ORIGIN).min() == pytest.approx(0.9)
 
 

@@ -21,18 +21,19 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from rtctl.control import pipe
-from rtctl.control.law import evaluate_law
-from rtctl.control.osc import operational_space
-from rtctl.control.pipe import initial, tick, warm
-from rtctl.control.robot import Robot
-from rtctl.hal import clock, ring
-from rtctl.hal.can import CanLink, LinkSpec
-from rtctl.servo import CAN_RX, TICK, Servo, first_feedback
+from rtctl.app.servo import CAN_RX, TICK, Servo, first_feedback
+from rtctl.arm import pipe
+from rtctl.arm.law import evaluate_law
+from rtctl.arm.osc import operational_space
+from rtctl.arm.pipe import initial, tick, warm
+from rtctl.arm.robot import Robot
+from rtctl.hal import clock
+from rtctl.hal.can.link import CanLink, LinkSpec
+from rtctl.log.record import ring
 from rtctl.types import I64, Command, Drive, Request
 from tools.bench_rig import Arm, BoundFloor, Bus, Case, Floor, Null, case, request, robot_and_spec
 
-# The blocks of the tick, in order: function of rtctl.control.pipe -> name of the row.
+# The blocks of the tick, in order: function of rtctl.arm.pipe -> name of the row.
 STAGES = {
     "_estimated": "estimate",
     "_perceived": "perceive",

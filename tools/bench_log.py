@@ -14,22 +14,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl import config as cfg
-from rtctl.assembly import header_of
+from rtctl import design as cfg
+from rtctl.app.arm import header_of
+from rtctl.app.replay import rebuilt
+from rtctl.app.servo import Servo
+from rtctl.app.sim import simulate
 from rtctl.hal import clock
-from rtctl.hal.can import CanLink
-from rtctl.hal.recorder import Recorder
+from rtctl.hal.can.link import CanLink
 from rtctl.log import read
-from rtctl.log.info import info
-from rtctl.log.report import write_report
-from rtctl.log.rows import Encoded
-from rtctl.log.run import read_run
+from rtctl.log.mcap.rows import Encoded
+from rtctl.log.mcap.segment import begin
+from rtctl.log.mcap.walk import chunk_messages
+from rtctl.log.read.info import info
+from rtctl.log.read.run import read_run
+from rtctl.log.record.recorder import Recorder
 from rtctl.log.schema import channels
-from rtctl.log.segment import begin
-from rtctl.log.walk import chunk_messages
-from rtctl.replay import rebuilt
-from rtctl.servo import Servo
-from rtctl.sim import simulate
+from rtctl.log.view.report import write_report
 from rtctl.types import Command, Drive
 from tools.bench_rig import CONFIG, Arm, Bus, request, robot_and_spec
 

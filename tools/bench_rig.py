@@ -11,20 +11,20 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rtctl import config as cfg
-from rtctl.assembly import link_spec
-from rtctl.control import guards, osc
+from rtctl import design as cfg
+from rtctl.app.arm import link_spec
+from rtctl.arm import guards, osc
+from rtctl.arm.memory import Memory
+from rtctl.arm.model import Model
+from rtctl.arm.osc import operational_space
+from rtctl.arm.points import Points
+from rtctl.arm.robot import Robot
 from rtctl.control.firas import field_buffers
-from rtctl.control.memory import Memory
-from rtctl.control.model import Model
-from rtctl.control.osc import operational_space
-from rtctl.control.points import Points
-from rtctl.control.primitives import Obstacles, obstacles_empty, with_shape
-from rtctl.control.robot import Robot
-from rtctl.hal.can import LinkSpec
-from rtctl.hal.transport import Seqpacket
+from rtctl.hal.can.link import LinkSpec
+from rtctl.hal.can.transport import Seqpacket
 from rtctl.protocol import e2e, frame, mit
 from rtctl.types import F64, I64, Drive, Feedback, Goal, ObstacleEdit, Request, Shape, State, Task, Verb
+from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / "configs" / "panda.toml"

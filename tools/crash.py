@@ -27,16 +27,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.reader import make_reader
 
-from rtctl import config as cfg
-from rtctl.assembly import header_of
-from rtctl.control.pipe import warm
-from rtctl.daemon import _review
+from rtctl import design as cfg
+from rtctl.app.arm import header_of
+from rtctl.app.daemon import _review
+from rtctl.app.servo import Servo, Turn
+from rtctl.arm.pipe import warm
 from rtctl.hal import clock
-from rtctl.hal import ring as rings
-from rtctl.hal.can import CanLink
-from rtctl.hal.recorder import Recorder, rescue
+from rtctl.hal.can.link import CanLink
 from rtctl.log import read
-from rtctl.servo import Servo, Turn
+from rtctl.log.record import ring as rings
+from rtctl.log.record.recorder import Recorder, rescue
 from rtctl.types import Command, Drive, Request, State, Verb
 from tools.bench_rig import CONFIG, Arm, Bus, request, robot_and_spec
 

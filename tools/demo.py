@@ -20,10 +20,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from rtctl import config as cfg
-from rtctl.config.scenario import Scenario, load_scenario, robot_file
+from rtctl import design as cfg
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError
 from rtctl.hal.client import Session, accepted
+from rtctl.spec.scenario import Scenario, load_scenario, robot_file
 from tools.outcome import WIDTH, Outcome, judge, show
 from tools.pair import DemoError, Pair, working_copy
 from tools.player import play

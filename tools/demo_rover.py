@@ -22,11 +22,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rtctl.config.scenario import Scenario, load_scenario
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError
 from rtctl.hal.client import Session, accepted
 from rtctl.log import read
-from rtctl.log.tlog import export_tlog
+from rtctl.log.view.tlog import export_tlog
+from rtctl.spec.scenario import Scenario, load_scenario
 
 WORLDS = {"disc": (22.8, 2.47), "three": (26.5, 2.52), "wall": (25.8, 2.66), "u": (32.1, 2.57)}  # [s], [m]
 WORLD_FILES = Path("configs/worlds")

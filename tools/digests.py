@@ -14,7 +14,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rtctl.sim import simulate
+from rtctl.app.sim import simulate
+
 from tools.golden import GOLDEN, cpu
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -3,8 +3,9 @@
 import sys
 from pathlib import Path
 
-from rtctl.control.base.faults import FAULTS as BASE_FAULTS
-from rtctl.control.faults import FAULTS, Fault
+from rtctl.arm.faults import FAULTS
+from rtctl.control.faults import Fault
+from rtctl.rover.faults import FAULTS as BASE_FAULTS
 
 README = Path(__file__).parents[1] / "README.md"
 BEGIN, END = "<!-- faults: printed by `python -m tools.faults` -->\n", "<!-- end of faults -->"

@@ -21,12 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import zstandard
 
+from rtctl.app.replay import Replay, replay
 from rtctl.errors import LogError, RtctlError
 from rtctl.log import schema
-from rtctl.log.rows import Encoded, message
-from rtctl.log.run import Run, read_run
-from rtctl.log.segment import begin
-from rtctl.replay import Replay, replay
+from rtctl.log.mcap.rows import Encoded, message
+from rtctl.log.mcap.segment import begin
+from rtctl.log.read.run import Run, read_run
 
 GOLDEN = Path(__file__).resolve().parent.parent / "tests" / "golden"
 INDEX = GOLDEN / "index.json"
@@ -83,7 +83,7 @@ def condensed(run: Run, path: Path) -> int:
 
 def record(name: str, reason: str) -> str:
     """Play a scenario anew and keep its log; return a line about it."""
-    from rtctl.sim import simulate
+    from rtctl.app.sim import simulate
 
     with tempfile.TemporaryDirectory(prefix="rtctl-golden-") as folder:
         source = Path(folder) / f"{name}.mcap"

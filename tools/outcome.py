@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rtctl.control.task import turns
+from rtctl.arm.task import turns
 from rtctl.types import F64
 from tools.trace import Trace
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rtctl import config as cfg
+from rtctl import design as cfg
 from rtctl.errors import RtctlError
 
 START_S = 600.0  # [s] for a process to be ready: the first ever compiles every kernel

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rtctl.config.scenario import Scenario, TimedGoal
 from rtctl.hal.client import Session, accepted
+from rtctl.spec.scenario import Scenario, TimedGoal
 from tools.outcome import Given
 from tools.pair import POLL, DemoError
 

@@ -14,8 +14,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from rtctl.control.so3 import R_of
 from rtctl.experiment.outline import axis_view, outline
+from rtctl.kernel.rotations import R_of
 from rtctl.types import F64, Shape
 from tools.outcome import REACHED, GoalOutcome, Outcome
 from tools.trace import Trace, Track

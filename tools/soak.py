@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_sim.rover import open_rover
-from rtctl.base import machine_of, open_link
-from rtctl.config.base import load
-from rtctl.config.base_derive import build
+from rtctl.app.rover import machine_of, open_link
+from rtctl.app.servo import Servo
+from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
-from rtctl.hal.wire import InProcess
-from rtctl.servo import Servo
+from rtctl.hal.mavlink.wire import InProcess
+from rtctl.spec.base import load
 from rtctl.types import Goal, Request, State, Status, Task, Verb
 
 DISC = {"name": "disc", "type": "cylinder", "radius_m": 1.0, "length_m": 2.0, "position_m": [8.0, 0.0, 0.0]}
@@ -107,7 +107,7 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
             sent, times = 0, []
         if realtime:
             time.sleep(max(0.0, begun + (slot + 1) * base.dt - time.monotonic()))
-    from rtctl.control.base.faults import names
+    from rtctl.rover.faults import names
 
     return samples[1:] if len(samples) > 2 else samples, rover.truth().contacts, list(names(servo.faults_seen))
 

@@ -6,17 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.config import Config
-from rtctl.config.obstacles import shape_of
-from rtctl.control import faults, world
-from rtctl.control.meshes import Meshes
-from rtctl.control.so3 import R_of
-from rtctl.control.task import error_of
+from rtctl.arm import faults
+from rtctl.arm.task import error_of
+from rtctl.design import Config
 from rtctl.errors import LogError
+from rtctl.kernel.rotations import R_of
 from rtctl.log import read, segments
 from rtctl.log.header import meshes_of
-from rtctl.log.replay import requests_of
+from rtctl.log.read.inputs import requests_of
+from rtctl.spec.obstacles import shape_of
 from rtctl.types import B1, F64, I64, Drive, Goal, Request, Shape, State
+from rtctl.world import obstacle_table
+from rtctl.world.meshes import Meshes
 
 FIELDS = (
     "tick",
@@ -133,13 +134,13 @@ def _spans(config: Config, known: Meshes, requests: Iterable[tuple[int, Request]
     edits = [shape_of(o) for o in config.obstacle]
     # the points of a config's own cloud are not in the log; here its name and place are enough
     edits = [s._replace(type="point") if s.type == "cloud" else s for s in edits]
-    table = world.with_static(world.empty(known=known), tuple(edits))
+    table = obstacle_table.with_static(obstacle_table.empty(known=known), tuple(edits))
     start, count = 0, len(ticks)
     for tick, request in requests:
         if request.obstacles:
             stop = int(np.searchsorted(ticks, tick))
             yield start, stop, table.names, edits
-            table, _ = world.edited(table, request.obstacles)
+            table, _ = obstacle_table.edited(table, request.obstacles)
             start, edits = stop, [e.shape for e in request.obstacles if e.shape is not None]
     yield start, count, table.names, edits
 

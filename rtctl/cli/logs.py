@@ -9,6 +9,7 @@ from typing import Any
 from rtctl.cli import pictures, replays
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.cli.progress import bar
+from rtctl.cli.values import table
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 
 
@@ -73,19 +74,8 @@ def _file(parser: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
-def table(rows: list[list[str]], head: list[str], right: frozenset[int] = frozenset()) -> str:
-    """Return rows as text under a head; the columns in `right` are numbers."""
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-
-    def line(row: list[str]) -> str:
-        cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
-        return "  ".join(cells).rstrip()
-
-    return "\n".join(line(row) for row in [head, *rows])
-
-
 def _info(arguments: argparse.Namespace) -> int:
-    from rtctl.log.info import info
+    from rtctl.log.read.info import info
 
     found = info(arguments.file)
     print(json.dumps(found) if arguments.json else _text(found))
@@ -108,7 +98,7 @@ def _text(found: dict[str, Any]) -> str:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from rtctl.log.examine import examine
+    from rtctl.log.mcap.examine import examine
 
     path = Path(arguments.file)
     with bar("examining", path.stat().st_size if path.is_file() else 1) as progress:
@@ -122,8 +112,8 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    from rtctl.hal.recorder import rescue
-    from rtctl.log.examine import mend, open_files
+    from rtctl.log.mcap.examine import mend, open_files
+    from rtctl.log.record.recorder import rescue
 
     path = Path(arguments.path)
     if path.is_dir():
@@ -161,9 +151,9 @@ def _free(path: Path) -> bool:
 
 
 def _can(arguments: argparse.Namespace) -> int:
-    from rtctl.log.export import buses
-    from rtctl.log.run import read_run
-    from rtctl.log.traffic import load_dbc, traffic
+    from rtctl.log.read.run import read_run
+    from rtctl.log.view.export import buses
+    from rtctl.log.view.traffic import load_dbc, traffic
 
     run = read_run(arguments.file)
     text = load_dbc(Path(arguments.dbc)) if arguments.dbc else ""
@@ -193,8 +183,8 @@ def _can(arguments: argparse.Namespace) -> int:
 
 
 def _mavlink(arguments: argparse.Namespace) -> int:
-    from rtctl.log.mavlink import listing
-    from rtctl.log.run import read_run
+    from rtctl.log.read.run import read_run
+    from rtctl.log.view.mavlink import listing
 
     found = listing(read_run(arguments.file))
     if arguments.json:
@@ -219,7 +209,7 @@ def _mavlink(arguments: argparse.Namespace) -> int:
 
 
 def _tail(arguments: argparse.Namespace) -> int:
-    from rtctl.log.follow import Follower, newest
+    from rtctl.log.read.follow import Follower, newest
 
     path = Path(arguments.path)
     follower = Follower(newest(path) if path.is_dir() else path)
@@ -252,7 +242,7 @@ def _say(event: dict[str, Any], as_json: bool) -> None:
 def _state(record: Any) -> dict[str, Any]:
     import numpy as np
 
-    from rtctl.log.fields import called
+    from rtctl.log.read.fields import called
     from rtctl.types import State, Status
 
     rho = record["rho"][np.isfinite(record["rho"])]

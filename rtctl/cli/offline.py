@@ -56,25 +56,25 @@ def add_after(commands: Commands) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from rtctl import config
+    from rtctl import design
 
-    if config.is_base(arguments.config):
-        report = config.check_base(arguments.config)
+    if design.is_base(arguments.config):
+        report = design.check_base(arguments.config)
     else:
-        loaded = config.load(arguments.config)
-        report = config.check(loaded, config.build(loaded, arguments.config))
+        loaded = design.load(arguments.config)
+        report = design.check(loaded, design.build(loaded, arguments.config))
     print(json.dumps(report.as_dict()) if arguments.json else report.render())
     return EXIT_OK
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from rtctl.daemon import run
+    from rtctl.app.daemon import run
 
     return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry)
 
 
 def _sim(arguments: argparse.Namespace) -> int:
-    from rtctl.sim import simulate
+    from rtctl.app.sim import simulate
 
     result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
     if arguments.json:
@@ -92,14 +92,14 @@ def _schema(arguments: argparse.Namespace) -> int:
 
 
 def _schema_of(what: str) -> dict[str, Any]:
-    from rtctl import config
+    from rtctl import design
 
     if what in ("config", "base"):
-        return config.json_schema(config.Config if what == "config" else config.BaseConfig)
+        return design.json_schema(design.Config if what == "config" else design.BaseConfig)
     import msgspec
 
-    from rtctl.config.scenario import Scenario
     from rtctl.hal.messages import Message
+    from rtctl.spec.scenario import Scenario
 
     schema = msgspec.json.schema(Scenario if what == "scenario" else Message)
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"rtctl {what}"}

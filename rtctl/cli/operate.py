@@ -139,11 +139,11 @@ def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
     """Read the points here, where the file is, and send them as one binary message."""
     from pathlib import Path
 
-    from rtctl.config.assets import load_cloud, placed
-    from rtctl.config.obstacles import Cloud, shape_of
-    from rtctl.config.scenario import parse_obstacle
+    from rtctl.design.assets import load_cloud, placed
     from rtctl.hal.client import Session, accepted
     from rtctl.hal.messages import cloud_message
+    from rtctl.spec.obstacles import Cloud, shape_of
+    from rtctl.spec.scenario import parse_obstacle
 
     cloud = parse_obstacle(described, "obstacle")
     assert isinstance(cloud, Cloud)

@@ -50,8 +50,8 @@ def add(actions: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from rtctl.log import export
-    from rtctl.log.run import read_run
+    from rtctl.log.read.run import read_run
+    from rtctl.log.view import export
 
     out = str(arguments.out)
     kind = arguments.format or ("csv" if out == "-" else ENDINGS.get(Path(out).suffix, ""))
@@ -86,12 +86,12 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    from rtctl.log.run import read_run
+    from rtctl.log.read.run import read_run
 
     run = read_run(arguments.file)
     if arguments.list:
-        from rtctl.cli.logs import table
-        from rtctl.log.fields import FIELDS, Field
+        from rtctl.cli.values import table
+        from rtctl.log.read.fields import FIELDS, Field
 
         none = Field("", "")
         dtype = run.header.dtype
@@ -101,7 +101,7 @@ def _plot(arguments: argparse.Namespace) -> int:
         ]
         print(table(rows, ["field", "shape", "unit", "what it is"]))
         return EXIT_OK
-    from rtctl.log.png import plot
+    from rtctl.log.view.plot import plot
 
     if arguments.stop <= arguments.start:
         raise UsageError(f"--to: got {arguments.stop:g}, wanted more than --from {arguments.start:g}")
@@ -112,15 +112,15 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from rtctl.log.report import write_report
-    from rtctl.log.run import read_run
+    from rtctl.log.read.run import read_run
+    from rtctl.log.view.report import write_report
 
     run = read_run(arguments.file)
     out = Path(arguments.out) if arguments.out else Path(arguments.file).with_suffix(".html")
     with bar("reporting", 100) as progress:
         found = write_report(run, out, progress)
         if arguments.png:
-            from rtctl.log.sheet import draw
+            from rtctl.log.view.sheet import draw
 
             draw(found, Path(arguments.png))
     print(out)

@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from rtctl import config as cfg
+from rtctl import design as cfg
+from rtctl.app.plan import plan
+from rtctl.app.stream import Follower, Seen
+from rtctl.arm.robot import Robot
+from rtctl.arm.task import turns
 from rtctl.cli.goals import send
 from rtctl.cli.parser import daemon_of
-from rtctl.config.assets import Assets, load_assets
-from rtctl.config.derive import loaded_shape
-from rtctl.config.obstacles import orientation_contradiction, quaternion
-from rtctl.config.scenario import load_scenario
-from rtctl.control import world
-from rtctl.control.primitives import CLOUD, Obstacles, obstacles_empty
-from rtctl.control.robot import Robot
-from rtctl.control.task import turns
+from rtctl.design.arm import loaded_shape
+from rtctl.design.assets import Assets, load_assets
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError, UsageError
 from rtctl.hal.client import Session, accepted
-from rtctl.planner import plan
-from rtctl.stream import Follower, Seen
+from rtctl.spec.obstacles import orientation_contradiction, quaternion
+from rtctl.spec.scenario import load_scenario
 from rtctl.types import F64, Goal, ObstacleEdit, Task
+from rtctl.world import obstacle_table
+from rtctl.world.primitives import CLOUD, Obstacles, obstacles_empty
 
 POLL = 0.02  # [s] between two looks at the status
 
@@ -73,8 +73,8 @@ def _described(arguments: argparse.Namespace, robot: Robot) -> tuple[F64, Obstac
         assets = load_assets((), scenario.obstacle, Path(arguments.scenario), robot.meshes)
         edits = tuple(ObstacleEdit(o.name, loaded_shape(o, assets)) for o in scenario.obstacle if o.appears_s == 0.0)
         start = start if start is not None else scenario.start_q_rad
-    table = world.with_static(world.empty(robot.slots, assets.meshes), robot.obstacles)
-    table, refusal = world.edited(table, edits)
+    table = obstacle_table.with_static(obstacle_table.empty(robot.slots, assets.meshes), robot.obstacles)
+    table, refusal = obstacle_table.edited(table, edits)
     if refusal:
         raise RequestError(f"{arguments.scenario}: {refusal}")
     q = robot.home if start is None else np.array(start, np.float64)

@@ -41,16 +41,16 @@ def add(actions: Commands) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from rtctl.app.replay import replay
     from rtctl.log import schema
-    from rtctl.log.run import read_run
-    from rtctl.replay import replay
+    from rtctl.log.read.run import read_run
 
     run = read_run(arguments.file)
     other = Path(arguments.config) if arguments.config else None
     with bar("replaying", run.count(schema.TICK) or 1) as progress:
         done = replay(run, other, progress)
     if arguments.plot:
-        from rtctl.log.png import plot_pair
+        from rtctl.log.view.plot import plot_pair
 
         labels = ("logged", "replayed" if other is None else other.name)
         shown = ("tau_sent", "Nm") if run.header.joints else ("v_world", "m/s")
@@ -84,7 +84,7 @@ def _as_dict(done: Any, other: Path | None) -> dict[str, Any]:
 def _text(done: Any, other: Path | None, run: Any) -> str:
     import numpy as np
 
-    from rtctl.cli.logs import table
+    from rtctl.cli.values import table
 
     lines = [f"{done.ticks} ticks, {done.frames} command frames, {done.speed:.1f} x real time"]
     if done.ignored:
@@ -129,14 +129,14 @@ def _blame(run: Any) -> str:
 
 
 def _diff(arguments: argparse.Namespace) -> int:
-    from rtctl.cli.logs import table
-    from rtctl.log.diff import diff
-    from rtctl.log.run import read_run
+    from rtctl.cli.values import table
+    from rtctl.log.read.run import read_run
+    from rtctl.log.view.diff import diff
 
     a, b = read_run(arguments.a), read_run(arguments.b)
     found = diff(a, b)
     if arguments.plot:
-        from rtctl.log.png import plot_pair
+        from rtctl.log.view.plot import plot_pair
 
         groups = [
             ("x", "m", *found.tip),

@@ -125,3 +125,14 @@ def _number(text: str, place: str) -> float:
 
 def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a number of JSON")
+
+
+def table(rows: list[list[str]], head: list[str], right: frozenset[int] = frozenset()) -> str:
+    """Return rows as text under a head; the columns in `right` are numbers."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+
+    def line(row: list[str]) -> str:
+        cells = [c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        return "  ".join(cells).rstrip()
+
+    return "\n".join(line(row) for row in [head, *rows])

@@ -1,41 +1,10 @@
-"""Goals: which are taken, and when one is reached."""
+"""Which goals a vehicle takes."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from rtctl.control.estimator import TipEstimate
-from rtctl.control.scan import norm
-from rtctl.control.task import selected, task_error
 from rtctl.types import F64, Goal
-
-STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
-GAIN = 0.12  # of full speed: who comes nearer more slowly is held by something
-
-
-class Progress(NamedTuple):
-    """How far the tip is from its goal, and how fast."""
-
-    error: float  # [m]
-    error_rot: float  # [rad], 0 for a position task
-    speed: float  # [m/s] of the tip
-    rate: float  # [rad/s] of the tip, 0 for a position task
-
-
-@njit(cache=True, fastmath=False)
-def _progress(
-    task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64, xd: F64, omega: F64
-) -> tuple[float, float, float, float]:
-    e, e_rot = task_error(task, axis, position, wxyz, x, R)
-    v, w = selected(task, axis, R, xd, omega)
-    return norm(e), norm(e_rot), norm(v), norm(w)
-
-
-def progress(goal: Goal, tip: TipEstimate) -> Progress:
-    """Return how far the tip is from a goal and how fast it is, along what the goal constrains."""
-    return Progress(*_progress(int(goal.task), goal.axis, goal.position, goal.wxyz, tip.x, tip.R, tip.xd, tip.omega))
 
 
 def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str, ...]) -> str:
@@ -54,36 +23,3 @@ def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str
     if goal_rho[k] < 0.0:
         return f"goal: lies {-goal_rho[k]:.3f} m inside obstacle {names[k]}"
     return ""
-
-
-def arrived(p: Progress, goal: Goal) -> bool:
-    """Return whether the tip rests within the goal's tolerances."""
-    return p.error <= goal.tolerance and p.error_rot <= goal.tolerance_rot and p.speed < 0.05 and p.rate < 0.2
-
-
-def at_rest(p: Progress) -> bool:
-    """Return whether the tip is still."""
-    return p.speed < STILL_SPEED and p.rate < 4.0 * STILL_SPEED
-
-
-def slow(p: Progress) -> bool:
-    """Return whether the tip goes nowhere at this speed. How fast it turns says nothing: to the goal is what counts."""
-    return p.speed < 4.0 * STILL_SPEED
-
-
-def time_left(p: Progress, v_max: float, w_max: float) -> float:
-    """Return the time [s] that the goal is away at full speed [m/s], [rad/s]."""
-    return max(p.error / v_max, p.error_rot / w_max)
-
-
-def idle(before: float, p: Progress, left: float, nearest: float, dt: float, window: float) -> float:
-    """Return for how long [s] the goal has not come nearer, `before` until a tick of dt [s] ago.
-
-    left [s] away now, `nearest` it ever was. At GAIN of full speed the time stands still, faster it falls; half of what
-    was left in a `window` [s] is enough: the last of a way is slow. It also falls while the tip moves fast, twice as
-    quickly as it grew: who trembles is idle all the same.
-    """
-    if not slow(p):
-        return max(0.0, before - 2.0 * dt)
-    pace = min(GAIN, 0.5 * nearest / window)
-    return max(0.0, before + dt - max(0.0, nearest - left) / max(pace, 1e-9))

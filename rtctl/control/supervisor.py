@@ -5,7 +5,7 @@ SAFE_STOP and FAULT are left only by an operator's reset. Nothing here resumes m
 
 from enum import IntEnum
 
-from rtctl.types import State
+from rtctl.types import Severity, State, Verb
 
 
 class Event(IntEnum):
@@ -23,6 +23,15 @@ class Event(IntEnum):
     SETTLED = 9  # drives enabled and the hold torque has built up
     RESTED = 10  # at rest, held long enough
 
+
+EVENT_OF = {
+    Verb.ARM: Event.ARM,
+    Verb.RECOVER: Event.ARM,
+    Verb.DISARM: Event.DISARM,
+    Verb.STOP: Event.STOP,
+    Verb.RESET: Event.RESET,
+}
+EVENT_FOR = {Severity.SS2: Event.SS2, Severity.SS1: Event.SS1, Severity.STO: Event.STO}
 
 S, E = State, Event
 TABLE: dict[tuple[State, Event], State] = {

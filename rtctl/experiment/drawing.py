@@ -31,7 +31,7 @@ def draw_shapes(axes: Axes, shapes: Iterable[Shape], seen: View, colour: str = S
 
 def half_space(shape: Shape, seen: View) -> F64:
     """Return a plane's solid side (4, 2) [m] where it is seen edge on; nothing where it is not."""
-    from rtctl.control.so3 import R_of
+    from rtctl.kernel.rotations import R_of
 
     normal, point = seen.of(R_of(shape.wxyz)[:, 2]), seen.of(shape.position)
     if np.linalg.norm(normal) < 0.9:

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.control.field import field
+from rtctl.arm.field import field
+from rtctl.arm.osc import MotionParams, motion_torque, velocity_reference
 from rtctl.control.firas import FieldParams, field_buffers
-from rtctl.control.osc import MotionParams, motion_torque, velocity_reference
-from rtctl.control.primitives import Obstacles, distances, obstacles_empty, with_shape
 from rtctl.types import F64, Shape
+from rtctl.world.primitives import Obstacles, distances, obstacles_empty, with_shape
 
 EYE = np.eye(3)
 J6 = np.vstack([EYE, np.zeros((3, 3))])

@@ -6,9 +6,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import ConvexHull
 
-from rtctl.control.model import RigidBody
-from rtctl.control.so3 import R_of
-from rtctl.control.solids import solids_of
+from rtctl.arm.model import RigidBody
+from rtctl.design.solids import solids_of
+from rtctl.kernel.rotations import R_of
 from rtctl.types import F64, Shape
 
 AROUND = np.linspace(0.0, 2.0 * np.pi, 145)

@@ -9,13 +9,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from rtctl.control.firas import FieldParams, field_params
-from rtctl.control.primitives import distance
-from rtctl.control.so3 import R_of
 from rtctl.experiment.mass import Flight, Mass, motion_params, obstacles_of, potential, turning_distance
 from rtctl.experiment.outline import axis_view, outline
 from rtctl.experiment.scene import Say, unsaid
 from rtctl.experiment.style import BLUE, GREEN, INK, ORANGE, PAPER, RED, STONE, Axes, note, page
+from rtctl.kernel.rotations import R_of
 from rtctl.types import F64, Shape
+from rtctl.world.primitives import distance
 
 TITLE = "A point mass in the field of an ellipsoid, a cylinder and a cone"
 CAPTION = "equipotentials, paths to a goal, and where energy lets a mass turn"

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl.config.obstacles import shape_of
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario
-from rtctl.config.urdf import urdf_file
-from rtctl.control.robot import Robot
+from rtctl.app.servo import Servo, Turn
+from rtctl.app.sim import simulate
+from rtctl.arm.robot import Robot
 from rtctl.errors import ConfigError
-from rtctl.servo import Servo, Turn
-from rtctl.sim import simulate
+from rtctl.spec.obstacles import shape_of
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario
+from rtctl.spec.urdf import urdf_file
 from rtctl.types import F64, I64, Shape, Truth
 
 Say = Callable[[float], None]  # takes the part (0 to 1) that is done
@@ -50,7 +50,7 @@ class Trace(NamedTuple):
     status: I64  # (T,) types.Status
     tau_limits: F64  # (T, n) [Nm]
     tau: F64  # (T, n) [Nm] sent
-    figures: dict[str, Any]  # of `rtctl.sim.simulate`
+    figures: dict[str, Any]  # of `rtctl.app.sim.simulate`
 
     def least(self) -> F64:
         """Return the clearance (T,) [m] to the nearest obstacle, by pybullet."""

@@ -14,21 +14,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from rtctl.config.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
-from rtctl.config.obstacles import (
-    Cloud,
-    Mesh,
-    Name,
-    Obstacle,
-    Orientation,
-    Place,
-    RollPitchYaw,
-    contradiction,
-    shape_of,
-)
-from rtctl.config.structs import Angles
-from rtctl.control.task import point_of, within
+from rtctl.arm.task import point_of, within
 from rtctl.errors import RequestError
+from rtctl.spec.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
+from rtctl.spec.obstacles import Cloud, Mesh, Name, Obstacle, Orientation, Place, RollPitchYaw, contradiction, shape_of
+from rtctl.spec.robot import Angles
 from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
 
 OBSTACLES_MAX = 64  # in one camera frame

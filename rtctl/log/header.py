@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from rtctl.control.meshes import NONE, Meshes, added
-from rtctl.control.record import record_dtype
+from rtctl.arm.record import record_dtype
 from rtctl.types import Shape
+from rtctl.world.meshes import NONE, Meshes, added
 
 PACKAGES = (
     "rtctl",

@@ -6,10 +6,10 @@ import numpy as np
 
 from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
-from rtctl.control.robot import Robot
-from rtctl.control.so3 import R_of
-from rtctl.control.task import error_of
-from rtctl.servo import Servo
+from rtctl.app.servo import Servo
+from rtctl.arm.robot import Robot
+from rtctl.arm.task import error_of
+from rtctl.kernel.rotations import R_of
 from rtctl.types import F64
 
 if TYPE_CHECKING:

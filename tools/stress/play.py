@@ -7,18 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_sim.plant import Contact, Plant
-from rtctl import config as cfg
-from rtctl.assembly import link_spec
-from rtctl.config import Config
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario
-from rtctl.control import faults
-from rtctl.control.robot import Robot
-from rtctl.hal.can import CanLink
+from rtctl import design as cfg
+from rtctl.app.arm import link_spec
+from rtctl.app.servo import Servo, Turn
+from rtctl.app.sim import Feed, Tally
+from rtctl.app.simulator import open_simulator
+from rtctl.arm import faults
+from rtctl.arm.robot import Robot
+from rtctl.design import Config
+from rtctl.hal.can.handshake import handshake
+from rtctl.hal.can.link import CanLink
+from rtctl.hal.can.transport import InProcess
 from rtctl.hal.clock import lockstep
-from rtctl.hal.transport import InProcess
-from rtctl.servo import Servo, Turn
-from rtctl.sim import Feed, Tally, open_simulator
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario
 from rtctl.types import F64, Severity, Status, Truth
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -127,7 +129,7 @@ def play(table: dict[str, Any], index: int) -> Seen:
     simulator: Any = open_simulator(CONFIGS / f"{name}.toml", scenario, CONFIGS / "stress.toml")
     link = CanLink(link_spec(config), InProcess.of(simulator))
     try:
-        servo = Servo(robot, link, None, link.handshake(listen=0.0, recover=True).q)
+        servo = Servo(robot, link, None, handshake(link, listen=0.0, recover=True).q)
         watch = Watch(robot, simulator.plant)
         _run(servo, scenario, simulator, watch)
         return _seen(servo, watch, name, index)

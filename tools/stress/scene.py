@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from rtctl.config import Config
-from rtctl.config.obstacles import pose_at, shape_of
-from rtctl.config.read import convert
-from rtctl.config.scenario import Scenario
-from rtctl.control.primitives import distance
-from rtctl.control.robot import Robot
-from rtctl.control.so3 import quat_of
+from rtctl.arm.robot import Robot
+from rtctl.design import Config
+from rtctl.kernel.rotations import quat_of
+from rtctl.spec.obstacles import pose_at, shape_of
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario
 from rtctl.types import F64
+from rtctl.world.primitives import distance
 
 SHORTEST, LONGEST = 5.0, 10.0  # [s] of a scenario
 SETTLING = 3.0  # [s] beside 1.5 times what the straight line takes at v_max: to settle, or to tell why not

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from rtctl.errors import HandshakeError
-from rtctl.hal.can import CanLink, LinkSpec, identifiers
-from rtctl.hal.transport import SocketCan, open_transport
+from rtctl.hal.can.handshake import handshake
+from rtctl.hal.can.link import CanLink, LinkSpec, identifiers
+from rtctl.hal.can.transport import SocketCan, open_transport
 from rtctl.protocol import frame, mit
 from rtctl.types import Command, Drive, Feedback, Link
 from tests.fake_drives import PERIOD, PROTOCOLS, FakeDrives, spec_of
@@ -105,7 +106,7 @@ def test_handshake_and_cycles_on_a_real_bus(vcan: str, protocol: str) -> None:
     with drives_on(vcan, spec) as drives, linked(vcan, spec) as link:
         drives.registers[2][mit.TIMEOUT] = 0
         drives.codes = [(0x8000 + 1000 * j, 0x800, 0x800) for j in range(N)]
-        greeting = link.handshake(listen=0.05, timeout=1.0)
+        greeting = handshake(link, listen=0.05, timeout=1.0)
         assert greeting.watchdogs_written == ("joint3",)
         loop = Loop(link)
         for _ in range(100):
@@ -132,7 +133,7 @@ def test_a_second_master_is_seen(vcan: str, can_id: int) -> None:
         timer = threading.Timer(0.05, lambda: somebody.send(frame.pack(can_id, mit.ENABLE)))
         timer.start()
         with pytest.raises(HandshakeError, match="one master"):
-            link.handshake(listen=5.0)
+            handshake(link, listen=5.0)
         timer.join()
 
 
@@ -208,10 +209,10 @@ def test_an_interface_that_goes_down_and_comes_up(vcan: str) -> None:
         assert link.write(STOP) == []
         assert Link.DOWN in flags(loop.read())
         with pytest.raises(HandshakeError, match="interface down"):
-            link.handshake(listen=0.0)
+            handshake(link, listen=0.0)
         run(f"ip link set {vcan} up")
         with drives_on(vcan, spec):
-            link.handshake(listen=0.0, timeout=1.0)
+            handshake(link, listen=0.0, timeout=1.0)
             loop.read()
             assert flags(loop.turn()) == Link.NONE
 
@@ -234,25 +235,25 @@ def test_an_interface_that_is_removed_is_opened_anew_within_a_second(vcan: str) 
             else:
                 pytest.fail("the link did not come back")
             assert link.wait_replies(2.0)
-            link.handshake(listen=0.0, timeout=1.0)
+            handshake(link, listen=0.0, timeout=1.0)
             assert flags(loop.turn()) == Link.NONE
 
 
 def test_the_handshake_refuses_a_short_transmit_queue(vcan: str) -> None:
     run(f"ip link set {vcan} txqueuelen 10")
     with linked(vcan, spec_of(N)) as link, pytest.raises(HandshakeError, match="vcan0: txqueuelen: got 10"):
-        link.handshake(listen=0.0)
+        handshake(link, listen=0.0)
 
 
 def test_the_handshake_refuses_an_interface_without_fd_frames(vcan: str) -> None:
     for command in ("down", "mtu 16", "up"):
         run(f"ip link set {vcan} {command}")
     with linked(vcan, spec_of(N)) as link, pytest.raises(HandshakeError, match="vcan0: mtu: got 16"):
-        link.handshake(listen=0.0)
+        handshake(link, listen=0.0)
 
 
 def test_drives_that_answer_in_classic_frames_are_refused(vcan: str) -> None:
     with drives_on(vcan, spec_of(N)) as drives, linked(vcan, spec_of(N)) as link:
         drives.mischief = lambda joint, raw: [frame.pack(0x11 + joint, raw[8:16])]
         with pytest.raises(HandshakeError, match="classic frame of 8 bytes"):
-            link.handshake(listen=0.0, timeout=1.0)
+            handshake(link, listen=0.0, timeout=1.0)

@@ -1,0 +1,200 @@
+"""Level of competence: what holds an arm that rests short of its goal, each named and each true.
+
+An arm at rest is in balance: the torque that drives it to the goal equals what opposes it. With tau_m = J^T Lambda F
+and the metric A^-1 of Gauss's principle, every opposing torque t has the share -t^T A^-1 tau_m / tau_m^T A^-1 tau_m,
+and the shares add up to one: who balances the drive, and by how much.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from rtctl.arm.field import Field, own_field
+from rtctl.arm.law import Law
+from rtctl.arm.memory import Memory
+from rtctl.arm.robot import Robot
+from rtctl.arm.task import error_of, selected, task_error
+from rtctl.kernel.linalg import matvec, symmetric_eigen, tmatvec
+from rtctl.kernel.reductions import norm
+from rtctl.types import F64, I64, Status
+
+HOLDS = 0.1  # share from which something is said to hold the arm
+LOST = 0.4  # fraction of the wanted acceleration that the tip can have, below which the direction is lost
+EDGE = 0.05  # [m] curvature of the tip's height along a direction that still counts as none: the reach ends there
+AT_BOUND = 1.0 - 1e-6  # of tau_max
+UNKNOWN = "something unknown"  # holds the arm
+
+
+class Balance(NamedTuple):
+    """Shares of what opposes the drive of an arm at rest, and what else can hold it."""
+
+    obstacles: F64  # (K,)
+    limits: F64  # (n,) of each joint's limit, 0 for joints outside the zones
+    own: float  # of links near each other
+    granted: float  # share of the wanted tip acceleration that the drive gives: 1, and 0 for a lost direction
+    full: F64  # (n,) |wanted torque| / tau_max
+    goal_rho: F64  # (K,) [m] from the goal to each obstacle
+    rho0: float  # [m]
+    edge: bool  # the tip is as far in the goal's direction as the links are long
+
+
+class Held(NamedTuple):
+    """What holds the arm."""
+
+    status: Status
+    mask: int  # bits of obstacle slots, or of joints for LIMITED and SATURATED
+    main: int  # the strongest of them, -1 for none
+
+
+def held(b: Balance) -> Held:
+    """Return what holds an arm with this balance.
+
+    The causes are tried from the one that hides the others: torque that ran out; then whatever opposes the drive,
+    joint limits or obstacles, the stronger first; then a drive that cannot move the tip.
+    """
+    full = np.flatnonzero(b.full >= AT_BOUND)
+    if len(full):
+        return Held(Status.SATURATED, _mask(full), int(b.full.argmax()))
+    walls, joints = np.flatnonzero(b.obstacles >= HOLDS), np.flatnonzero(b.limits >= HOLDS)
+    lost = b.granted < LOST
+    if len(joints) and b.limits.sum() >= b.obstacles.sum() and (not lost or b.limits.sum() > 0.5):
+        return Held(Status.LIMITED, _mask(joints), int(b.limits.argmax()))
+    if len(walls) and not lost:
+        shadowed = bool((b.goal_rho[walls] < b.rho0).all())
+        status = Status.SHADOWED if shadowed else Status.LOCAL_MINIMUM
+        return Held(status, _mask(walls), int(b.obstacles.argmax()))
+    if lost:
+        return Held(Status.UNREACHABLE if b.edge else Status.SINGULAR, 0, -1)
+    return Held(Status.LOCAL_MINIMUM, 0, -1)
+
+
+def balance(robot: Robot, m: Memory, law: Law, tau_wanted: F64) -> Balance:
+    """Return the balance of this tick; `law` must be its law, for the field's work arrays are read."""
+    assert m.goal is not None
+    e, _ = task_error(int(m.goal.task), m.goal.axis, m.goal.position, m.goal.wxyz, m.tip.x, m.tip.R)
+    tau_own, _, _ = own_field(
+        m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
+    )
+    obstacles, limits, own, granted = _shares(
+        _drive(robot, m, law), m.model.J, m.model.A_inv, m.space.Lambda, m.model.Jp, robot.points.link, robot.scratch,
+        tau_own, law.tau_obstacles, law.tau_limits, m.joints.q, robot.q_min, robot.q_max, robot.limit.rho0,
+    )  # fmt: skip
+    return Balance(
+        obstacles, limits, own, granted, np.abs(tau_wanted) / robot.tau_max, m.goal_rho, robot.avoid.rho0,
+        norm(e) > m.goal.tolerance and at_edge(m.model.J, e),
+    )  # fmt: skip
+
+
+def _drive(robot: Robot, m: Memory, law: Law) -> F64:
+    """Return the tip's acceleration (6,) that the goal asks for, zero along what it leaves free."""
+    assert m.goal is not None
+    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, law.v_ref, law.w_ref)
+    return robot.motion.k_v * np.concatenate((v, w))
+
+
+@njit(cache=True, fastmath=False)
+def _shares(
+    F: F64, J: F64, A_inv: F64, Lambda: F64, Jp: F64, link: I64, field: Field, tau_own: F64,
+    tau_obstacles: F64, tau_limits: F64, q: F64, q_min: F64, q_max: F64, zone: F64,
+) -> tuple[F64, F64, float, float]:  # fmt: skip
+    """Return the fields of `Balance` from `obstacles` to `granted`."""
+    n, slots = q.shape[0], field.leader.shape[0]
+    tau_m = tmatvec(J, matvec(Lambda, F))
+    qdd = matvec(A_inv, tau_m)
+    has = matvec(J, qdd)
+    total, wanted, given, scale = 1e-12, 1e-12, 0.0, 1.0
+    for i in range(n):
+        total += tau_m[i] * qdd[i]
+    for i in range(6):  # F is zero along what the goal leaves free
+        wanted += F[i] * F[i]
+        given += F[i] * has[i]
+    raw = norm(field.tau + tau_own)
+    if raw > 0.0:  # a field that asks for more than the motors have was scaled
+        scale = norm(tau_obstacles) / raw
+    obstacles, limits, own = np.zeros(slots), np.zeros(n), 0.0
+    for k in range(slots):
+        if field.leader[k] < 0:
+            continue
+        for j in range(link.shape[0]):
+            f = field.pairs[k, 5, j]
+            if f != 0.0:
+                f *= scale * field.pairs[k, 4, j] / field.share[field.leader[k], link[j]]
+                for c in range(3):
+                    for i in range(n):
+                        obstacles[k] -= f * field.pairs[k, 1 + c, j] * Jp[j, c, i] * qdd[i] / total
+    for i in range(n):
+        own -= scale * tau_own[i] * qdd[i] / total
+        room = q_max[i] - q[i] if qdd[i] > 0.0 else q[i] - q_min[i]
+        if room < zone[i] and tau_limits[i] * qdd[i] < 0.0:
+            limits[i] = -tau_limits[i] * qdd[i] / total
+    return obstacles, limits, own, given / wanted
+
+
+@njit(cache=True, fastmath=False)
+def at_edge(J: F64, e: F64) -> bool:
+    """Return whether no small motion of any joints takes the tip further along e (3,).
+
+    To the second order: d2 (u.x)/dq_i dq_j = u . (z_i x J_j), i <= j, has no positive eigenvalue. J (6, n).
+    """
+    n = J.shape[1]
+    u = e / max(norm(e), 1e-12)
+    H = np.empty((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            x = J[4, i] * J[2, j] - J[5, i] * J[1, j]
+            y = J[5, i] * J[0, j] - J[3, i] * J[2, j]
+            z = J[3, i] * J[1, j] - J[4, i] * J[0, j]
+            H[i, j] = u[0] * x + u[1] * y + u[2] * z
+            H[j, i] = H[i, j]
+    values, _ = symmetric_eigen(H)
+    largest = values[0]
+    for i in range(n):
+        largest = max(largest, values[i])
+    return bool(largest <= EDGE)
+
+
+def names(robot: Robot, m: Memory, law: Law, found: Held) -> tuple[str, ...]:
+    """Return what holds the arm in words, the strongest first."""
+    bits = [i for i in range(64) if found.mask >> i & 1]
+    order = sorted(bits, key=lambda i: i != found.main)
+    match found.status:
+        case Status.LIMITED:
+            return tuple(f"{robot.joints[i]} at its {_end(robot, m.joints.q, i)} limit" for i in order)
+        case Status.SATURATED:
+            return tuple(robot.joints[i] for i in order)
+        case Status.SINGULAR | Status.UNREACHABLE:
+            return (_lost(robot, m, law, found.status),)
+        case Status.LOCAL_MINIMUM if not order:
+            pair = int(m.model.own_rho.argmin()) if len(m.model.own_rho) else -1
+            near = pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0
+            return (" and ".join(robot.own.names[pair]),) if near else (UNKNOWN,)
+        case _:
+            return tuple(f"{m.world.names[k]} at {_link(robot, k)}" for k in order)
+
+
+def _link(robot: Robot, k: int) -> str:
+    """Return the link that obstacle k pushes most."""
+    return robot.points.names[int(robot.scratch.pairs[k, 5].argmax())]
+
+
+def _lost(robot: Robot, m: Memory, law: Law, status: Status) -> str:
+    """Return the direction that the joints do not give the tip: the wanted acceleration less what it gets."""
+    assert m.goal is not None
+    F = _drive(robot, m, law)
+    miss = F - matvec(m.model.J, matvec(m.model.A_inv, tmatvec(m.model.J, matvec(m.space.Lambda, F))))
+    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, miss[:3], miss[3:])
+    linear = status == Status.UNREACHABLE or norm(v) > robot.motion.length * norm(w)
+    part, word = (v, "move along") if linear else (w, "turn about")
+    u = part / max(norm(part), 1e-12)
+    error, _ = error_of(m.goal, m.tip.x, m.tip.R)
+    far = f", {error:.3f} m too far" if status == Status.UNREACHABLE else ""
+    return f"cannot {word} {u[0]:+.2f} {u[1]:+.2f} {u[2]:+.2f}{far}"
+
+
+def _end(robot: Robot, q: F64, i: int) -> str:
+    return "lower" if q[i] - robot.q_min[i] < robot.q_max[i] - q[i] else "upper"
+
+
+def _mask(bits: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> int:
+    return sum(1 << int(i) for i in bits)

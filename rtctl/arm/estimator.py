@@ -1,0 +1,266 @@
+"""Estimators that carry the state between measurements: the tip's pose and velocity, and each joint's.
+
+Every axis is the unit mass that the law's decoupling promises: state (x, xd), input the commanded acceleration F*,
+process noise what the model does not know of it, held constant over a step. One 2 x 2 covariance serves all axes
+that share their noise. filterpy designs the filters (`design`, `design_joint`) and is the oracle of the compiled
+form in the tests. Pure: an estimate goes in and a new one comes out; a NaN goes through and is the caller's to find.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from rtctl.kernel.linalg import matvec
+from rtctl.kernel.rotations import compose, error, exp3, orthonormal
+from rtctl.types import B1, F64, I64
+
+
+class EstimatorParams(NamedTuple):
+    """Standard deviations of the tip filter, per axis."""
+
+    sigma_a: float  # [m/s2] acceleration that F* does not explain
+    sigma_alpha: float  # [rad/s2]
+    r_v: float  # [m/s] of xd = J qd
+    r_omega: float  # [rad/s]
+    r_x: float  # [m] of x = fk(q)
+    r_rot: float  # [rad]
+
+
+class TipEstimate(NamedTuple):
+    """The tip at one instant, and how sure the filter is of it."""
+
+    x: F64  # (3,) [m]
+    xd: F64  # (3,) [m/s]
+    P: F64  # (2, 2) covariance of (x, xd), the same for each axis
+    R: F64  # (3, 3)
+    omega: F64  # (3,) [rad/s] in the world frame
+    P_rot: F64  # (2, 2) covariance of (rotation error, omega)
+
+
+class Design(NamedTuple):
+    """The tip filter in its steady state, as filterpy finds it; gains act on (x, xd) or (rotation, omega)."""
+
+    Q: F64  # (2, 2) process noise of one step
+    Q_rot: F64  # (2, 2)
+    P: F64  # (2, 2) after a pose update: what a filter may start from
+    P_rot: F64  # (2, 2)
+    gain_velocity: F64  # (2,) just before that pose update
+    gain_velocity_rot: F64  # (2,)
+    gain_pose: F64  # (2,)
+    gain_pose_rot: F64  # (2,)
+
+
+class JointParams(NamedTuple):
+    """Noise of the joint filters."""
+
+    sigma_qdd: F64  # (n,) [rad/s2] acceleration that the input does not explain
+    r_q: F64  # (n,) [rad] standard deviation of a measured position: LSB / sqrt(12) of the encoder
+    r_qd: F64  # (n,) [rad/s] of a measured velocity
+    has_qd: bool  # the drive reports a velocity worth using
+
+
+class JointEstimate(NamedTuple):
+    """Every joint at one instant."""
+
+    q: F64  # (n,) [rad]
+    qd: F64  # (n,) [rad/s]
+    P: F64  # (n, 2, 2) covariance of (q, qd)
+
+
+def start(x: F64, R: F64, design: Design) -> TipEstimate:
+    """Return the estimate of a tip at rest, as sure as the filter will be in its steady state."""
+    return TipEstimate(x.copy(), np.zeros(3), design.P.copy(), R.copy(), np.zeros(3), design.P_rot.copy())
+
+
+def held(est: TipEstimate, x: F64, R: F64, J: F64, qd: F64) -> TipEstimate:
+    """Return the tip as one evaluation knows it, unfiltered: what a servo without estimator holds until the next.
+
+    x (3,) [m], R (3, 3), J (6, n) of the evaluation; qd (n,) [rad/s].
+    """
+    twist = matvec(J, qd)
+    return est._replace(x=x.copy(), xd=twist[:3].copy(), R=R.copy(), omega=twist[3:].copy())
+
+
+def predict(est: TipEstimate, a: F64, alpha: F64, dt: float, params: EstimatorParams) -> TipEstimate:
+    """Return the estimate dt later: x += xd dt + a dt^2/2, xd += a dt, R <- exp(omega dt + alpha dt^2/2) R.
+
+    a: (3,) [m/s2] and alpha: (3,) [rad/s2], the commanded F*. dt [s].
+    """
+    return TipEstimate(*_predict(*est, a, alpha, dt, params.sigma_a, params.sigma_alpha))
+
+
+def update_velocity(est: TipEstimate, xd: F64, omega: F64, params: EstimatorParams) -> tuple[TipEstimate, float]:
+    """Return the estimate after a measured twist J qd, and its normalised innovation.
+
+    The innovation is root mean square over the six axes in standard deviations: about 1 when the noise is as stated.
+    xd: (3,) [m/s]. omega: (3,) [rad/s].
+    """
+    *fields, innovation = _update_velocity(*est, xd, omega, params.r_v, params.r_omega)
+    return TipEstimate(*fields), innovation
+
+
+def update_pose(est: TipEstimate, x: F64, R: F64, age: float, params: EstimatorParams) -> tuple[TipEstimate, float]:
+    """Return the estimate after a pose fk(q) measured `age` [s] ago, and its normalised innovation.
+
+    The measurement is of x - age xd, so that its age is neither a bias nor false certainty. x: (3,) [m]. R: (3, 3).
+    """
+    *fields, innovation = _update_pose(*est, x, R, age, params.r_x, params.r_rot)
+    return TipEstimate(*fields), innovation
+
+
+def tip_step(
+    est: TipEstimate, J: F64, Jdqd: F64, qdd: F64, J_now: F64, qd: F64, dt: float, params: EstimatorParams
+) -> tuple[TipEstimate, float]:
+    """Return `predict` by the acceleration J qdd + Jdqd, then `update_velocity` with J_now qd, and its innovation.
+
+    J, Jdqd (6, n), (6,): of the step's start, qdd (n,) [rad/s2] during it. J_now (6, n), qd (n,) [rad/s]: of its end.
+    """
+    p = params
+    *fields, innovation = _tip_step(*est, J, Jdqd, qdd, J_now, qd, dt, p.sigma_a, p.sigma_alpha, p.r_v, p.r_omega)
+    return TipEstimate(*fields), innovation
+
+
+def joint_start(q: F64, P: F64) -> JointEstimate:
+    """Return the estimate of joints at rest; P: (n, 2, 2), from `design_joint`."""
+    return JointEstimate(q.copy(), np.zeros_like(q), P.copy())
+
+
+def joint_step(
+    est: JointEstimate, qdd: F64, q: F64, qd: F64, age: F64, replies: I64 | B1, dt: float, params: JointParams
+) -> tuple[JointEstimate, F64]:
+    """Return the joints dt later, corrected by what the drives measured `age` ago, and normalised innovations (n,).
+
+    qdd: (n,) [rad/s2] acceleration the model expects, zero when unknown. q, qd: (n,) measured. age: (n,) [s].
+    replies: (n,) measurements that this cycle brought of each joint; those without coast, with innovation 0.
+    """
+    noise = (params.sigma_qdd, params.r_q, params.r_qd)
+    *fields, innovation = _joint_step(*est, qdd, q, qd, age, replies, dt, *noise, params.has_qd)
+    return JointEstimate(*fields), innovation
+
+
+@njit(cache=True, fastmath=False)
+def _propagate(P: F64, dt: float, sigma: float) -> F64:
+    """Return F P F^T + Q for F = [1 dt; 0 1] and an acceleration of deviation sigma, constant over the step."""
+    q = sigma * sigma * dt * dt
+    p01 = P[0, 1] + dt * P[1, 1]
+    out = np.empty((2, 2))
+    out[0, 0] = P[0, 0] + dt * (P[0, 1] + p01) + 0.25 * dt * dt * q
+    out[0, 1] = p01 + 0.5 * dt * q
+    out[1, 0] = out[0, 1]
+    out[1, 1] = P[1, 1] + q
+    return out
+
+
+@njit(cache=True, fastmath=False)
+def _correct(P: F64, h0: float, h1: float, r: float) -> tuple[float, float, float, F64]:
+    """Return S, the gains and the covariance after a scalar measurement h0 x + h1 xd of deviation r (Joseph form)."""
+    g0 = P[0, 0] * h0 + P[0, 1] * h1
+    g1 = P[1, 0] * h0 + P[1, 1] * h1
+    S = h0 * g0 + h1 * g1 + r * r
+    k0, k1 = g0 / S, g1 / S
+    m00, m01, m10, m11 = 1.0 - k0 * h0, -k0 * h1, -k1 * h0, 1.0 - k1 * h1  # I - K H
+    a00, a01 = m00 * P[0, 0] + m01 * P[1, 0], m00 * P[0, 1] + m01 * P[1, 1]
+    a10, a11 = m10 * P[0, 0] + m11 * P[1, 0], m10 * P[0, 1] + m11 * P[1, 1]
+    out = np.empty((2, 2))
+    out[0, 0] = a00 * m00 + a01 * m01 + k0 * k0 * r * r
+    out[0, 1] = a00 * m10 + a01 * m11 + k0 * k1 * r * r
+    out[1, 0] = out[0, 1]
+    out[1, 1] = a10 * m10 + a11 * m11 + k1 * k1 * r * r
+    return S, k0, k1, out
+
+
+@njit(cache=True, fastmath=False)
+def _predict(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
+    a: F64, alpha: F64, dt: float, sigma_a: float, sigma_alpha: float,
+) -> tuple[F64, F64, F64, F64, F64, F64]:  # fmt: skip
+    x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        x1[i] = x[i] + dt * (xd[i] + 0.5 * dt * a[i])
+        xd1[i] = xd[i] + dt * a[i]
+        turn[i] = dt * (omega[i] + 0.5 * dt * alpha[i])
+        omega1[i] = omega[i] + dt * alpha[i]
+    R1 = orthonormal(compose(exp3(turn), R))
+    return x1, xd1, _propagate(P, dt, sigma_a), R1, omega1, _propagate(P_rot, dt, sigma_alpha)
+
+
+@njit(cache=True, fastmath=False)
+def _update_velocity(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
+    xd_measured: F64, omega_measured: F64, r_v: float, r_omega: float,
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
+    S, k0, k1, P1 = _correct(P, 0.0, 1.0, r_v)
+    S_rot, l0, l1, P_rot1 = _correct(P_rot, 0.0, 1.0, r_omega)
+    x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    total = 0.0
+    for i in range(3):
+        y, y_rot = xd_measured[i] - xd[i], omega_measured[i] - omega[i]
+        x1[i], xd1[i] = x[i] + k0 * y, xd[i] + k1 * y
+        turn[i], omega1[i] = l0 * y_rot, omega[i] + l1 * y_rot
+        total += y * y / S + y_rot * y_rot / S_rot
+    R1 = orthonormal(compose(exp3(turn), R))
+    return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
+
+
+@njit(cache=True, fastmath=False)
+def _tip_step(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
+    J: F64, Jdqd: F64, qdd: F64, J_now: F64, qd: F64, dt: float,
+    sigma_a: float, sigma_alpha: float, r_v: float, r_omega: float,
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
+    a = matvec(J, qdd) + Jdqd
+    x1, xd1, P1, R1, omega1, P_rot1 = _predict(x, xd, P, R, omega, P_rot, a[:3], a[3:], dt, sigma_a, sigma_alpha)
+    twist = matvec(J_now, qd)
+    return _update_velocity(x1, xd1, P1, R1, omega1, P_rot1, twist[:3], twist[3:], r_v, r_omega)
+
+
+@njit(cache=True, fastmath=False)
+def _update_pose(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
+    x_measured: F64, R_measured: F64, age: float, r_x: float, r_rot: float,
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
+    S, k0, k1, P1 = _correct(P, 1.0, -age, r_x)
+    S_rot, l0, l1, P_rot1 = _correct(P_rot, 1.0, -age, r_rot)
+    x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        turn[i] = -age * omega[i]
+    y_rot = error(compose(exp3(turn), R), R_measured)
+    total = 0.0
+    for i in range(3):
+        y = x_measured[i] - (x[i] - age * xd[i])
+        x1[i], xd1[i] = x[i] + k0 * y, xd[i] + k1 * y
+        turn[i], omega1[i] = l0 * y_rot[i], omega[i] + l1 * y_rot[i]
+        total += y * y / S + y_rot[i] * y_rot[i] / S_rot
+    R1 = orthonormal(compose(exp3(turn), R))
+    return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
+
+
+@njit(cache=True, fastmath=False)
+def _joint_step(
+    q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, replies: I64 | B1, dt: float,
+    sigma_qdd: F64, r_q: F64, r_qd: F64, has_qd: bool,
+) -> tuple[F64, F64, F64, F64]:  # fmt: skip
+    n = q.shape[0]
+    q1, qd1, P1, innovation = np.empty(n), np.empty(n), np.empty((n, 2, 2)), np.zeros(n)
+    for i in range(n):
+        position = q[i] + dt * (qd[i] + 0.5 * dt * qdd[i])
+        speed = qd[i] + dt * qdd[i]
+        C = _propagate(P[i], dt, sigma_qdd[i])
+        if replies[i] > 0:
+            t = age[i]
+            y = q_measured[i] - (position - t * speed + 0.5 * t * t * qdd[i])
+            S, k0, k1, C = _correct(C, 1.0, -t, r_q[i])
+            position, speed = position + k0 * y, speed + k1 * y
+            innovation[i] = abs(y) / math.sqrt(S)
+            if has_qd:
+                y = qd_measured[i] - (speed - t * qdd[i])
+                S, k0, k1, C = _correct(C, 0.0, 1.0, r_qd[i])
+                position, speed = position + k0 * y, speed + k1 * y
+                innovation[i] = max(innovation[i], abs(y) / math.sqrt(S))
+        q1[i], qd1[i] = position, speed
+        for r in range(2):
+            for c in range(2):
+                P1[i, r, c] = C[r, c]
+    return q1, qd1, P1, innovation

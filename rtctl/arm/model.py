@@ -1,0 +1,390 @@
+"""The parameter-evaluation level: rigid-body dynamics and kinematics of one arm from its URDF (Pinocchio).
+
+`RigidBody.evaluate` runs at the model rate. It takes Pinocchio's results through views held from the start and one
+compiled kernel turns them into a `Model`: fresh arrays, no BLAS, equal bits for equal inputs.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numba import njit
+
+from rtctl.arm.points import Points
+from rtctl.arm.self_collision import Own
+from rtctl.errors import ConfigError
+from rtctl.types import B1, F64, I64
+
+
+class Model(NamedTuple):
+    """What the law needs to know of the arm at one configuration; world frame, tip = the configured frame.
+
+    m PSPs; L pairs of links that are watched for self-collision.
+    """
+
+    q: F64  # (n,) [rad or m] where it was evaluated
+    qd: F64  # (n,)
+    A: F64  # (n, n) joint-space kinetic energy matrix, armature included
+    A_inv: F64  # (n, n)
+    h: F64  # (n,) [Nm] Coriolis and centrifugal torque, gravity excluded
+    g: F64  # (n,) [Nm] gravity torque
+    x: F64  # (3,) [m] tip position
+    R: F64  # (3, 3) tip orientation
+    J: F64  # (6, n) tip Jacobian, rows 0-2 linear, 3-5 angular
+    Jdqd: F64  # (6,) [m/s2, rad/s2] its velocity product: the tip's acceleration at zero qdd
+    P: F64  # (m, 3) [m]
+    Jp: F64  # (m, 3, n)
+    B: F64  # (m, 3, 3) [1/kg] mobility of a PSP, Jp A^-1 Jp^T
+    Lambda_inv: F64  # (6, 6) J A^-1 J^T
+    own_rho: F64  # (L,) [m] between links, inf when far
+    own_row: F64  # (L, n) d own_rho/d q
+
+
+class JointLimits(NamedTuple):
+    """Limits that the URDF states, in the order of the joint names."""
+
+    q_min: F64  # (n,) [rad or m]; -inf for a continuous joint
+    q_max: F64  # (n,)
+    qd_max: F64  # (n,) [rad/s or m/s]
+    tau_max: F64  # (n,) [Nm or N]
+
+
+@njit(cache=True, fastmath=False)
+def spd_inverse(A: F64) -> F64:
+    """Return the inverse of a symmetric positive definite matrix by Cholesky, A = L L^T; NaN where A is not."""
+    n = A.shape[0]
+    L = np.zeros((n, n))  # strictly lower part of L
+    X = np.zeros((n, n))  # L^-1
+    for j in range(n):
+        d = A[j, j]
+        for k in range(j):
+            d -= L[j, k] * L[j, k]
+        pivot = np.sqrt(d) if d > 0.0 else np.nan
+        X[j, j] = 1.0 / pivot
+        for i in range(j + 1, n):
+            s = A[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            L[i, j] = s / pivot
+    for j in range(n):
+        for i in range(j + 1, n):
+            s = 0.0
+            for k in range(j, i):
+                s -= L[i, k] * X[k, j]
+            X[i, j] = s * X[i, i]
+    inverse = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(i, n):
+                s += X[k, i] * X[k, j]
+            inverse[i, j] = s
+            inverse[j, i] = s
+    return inverse
+
+
+@njit(cache=True, fastmath=False)
+def _place_points(Rj: F64, tj: F64, link: I64, local: F64, P: F64) -> None:
+    """Write the world positions of points fixed in links to P."""
+    for i in range(link.shape[0]):
+        k = link[i]
+        for r in range(3):
+            P[i, r] = tj[k, r] + Rj[k, r, 0] * local[i, 0] + Rj[k, r, 1] * local[i, 1] + Rj[k, r, 2] * local[i, 2]
+
+
+@njit(cache=True, fastmath=False)
+def _point_jacobians(Jw: F64, iv: I64, chain: B1, link: I64, P: F64, Jp: F64) -> None:
+    """Write the Jacobians of points: column k is v_k + w_k x p of the joint's twist at the world origin."""
+    for i in range(link.shape[0]):
+        px, py, pz = P[i, 0], P[i, 1], P[i, 2]
+        for k in range(iv.shape[0]):
+            if chain[link[i], k]:
+                c = iv[k]
+                Jp[i, 0, k] = Jw[0, c] + Jw[4, c] * pz - Jw[5, c] * py
+                Jp[i, 1, k] = Jw[1, c] + Jw[5, c] * px - Jw[3, c] * pz
+                Jp[i, 2, k] = Jw[2, c] + Jw[3, c] * py - Jw[4, c] * px
+
+
+@njit(cache=True, fastmath=False)
+def _quadratic(J: F64, A_inv: F64, used: int, out: F64) -> None:
+    """Write J A^-1 J^T, symmetric to the bit, to out (d, d); columns of J (d, n) from `used` on are zero."""
+    d = J.shape[0]
+    row = np.empty(used)
+    for r in range(d):
+        for k in range(used):
+            row[k] = 0.0
+        for i in range(used):
+            for k in range(used):
+                row[k] += J[r, i] * A_inv[i, k]
+        for s in range(r + 1):
+            total = 0.0
+            for k in range(used):
+                total += row[k] * J[s, k]
+            out[r, s] = total
+            out[s, r] = total
+
+
+@njit(cache=True, fastmath=False)
+def _used(chain: B1, link: int) -> int:
+    """Return 1 + the last joint that moves a link, 0 for the base."""
+    for k in range(chain.shape[1] - 1, -1, -1):
+        if chain[link, k]:
+            return k + 1
+    return 0
+
+
+@njit(cache=True, fastmath=False)
+def _tip(Jw: F64, dJw: F64, iv: I64, chain: B1, tip: int, x: F64, qd: F64) -> tuple[F64, F64]:
+    """Return the tip's Jacobian and velocity product from twists and spatial accelerations at the world origin.
+
+    The point's acceleration is a + alpha x p + omega x v: the spatial one lacks the last term.
+    """
+    n = iv.shape[0]
+    J = np.zeros((6, n))
+    v = np.zeros(6)
+    a = np.zeros(6)
+    for k in range(n):
+        if chain[tip, k]:
+            c = iv[k]
+            J[0, k] = Jw[0, c] + Jw[4, c] * x[2] - Jw[5, c] * x[1]
+            J[1, k] = Jw[1, c] + Jw[5, c] * x[0] - Jw[3, c] * x[2]
+            J[2, k] = Jw[2, c] + Jw[3, c] * x[1] - Jw[4, c] * x[0]
+            for r in range(3, 6):
+                J[r, k] = Jw[r, c]
+            for r in range(6):
+                v[r] += J[r, k] * qd[k]
+                a[r] += dJw[r, c] * qd[k]
+    Jdqd = a.copy()
+    Jdqd[0] += a[4] * x[2] - a[5] * x[1] + v[4] * v[2] - v[5] * v[1]
+    Jdqd[1] += a[5] * x[0] - a[3] * x[2] + v[5] * v[0] - v[3] * v[2]
+    Jdqd[2] += a[3] * x[1] - a[4] * x[0] + v[3] * v[1] - v[4] * v[0]
+    return J, Jdqd
+
+
+@njit(cache=True, fastmath=False)
+def _assemble(
+    M: F64, nle: F64, gravity: F64, Jw: F64, dJw: F64, Rj: F64, tj: F64, qd: F64,
+    iv: I64, chain: B1, tip: int, tip_R: F64, tip_t: F64,
+    link: I64, local: F64,
+) -> tuple[F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64]:  # fmt: skip
+    """Return every array of a `Model` after q and qd, in order, from Pinocchio's data at one configuration."""
+    n, m = iv.shape[0], link.shape[0]
+    A = np.empty((n, n))
+    h = np.empty(n)
+    g = np.empty(n)
+    for i in range(n):
+        g[i] = gravity[iv[i]]
+        h[i] = nle[iv[i]] - g[i]
+        for j in range(n):
+            A[i, j] = M[iv[i], iv[j]]
+    A_inv = spd_inverse(A)
+    x = np.empty(3)
+    R = np.empty((3, 3))
+    for i in range(3):
+        x[i] = tj[tip, i] + Rj[tip, i, 0] * tip_t[0] + Rj[tip, i, 1] * tip_t[1] + Rj[tip, i, 2] * tip_t[2]
+        for j in range(3):
+            R[i, j] = Rj[tip, i, 0] * tip_R[0, j] + Rj[tip, i, 1] * tip_R[1, j] + Rj[tip, i, 2] * tip_R[2, j]
+    J, Jdqd = _tip(Jw, dJw, iv, chain, tip, x, qd)
+    Lambda_inv = np.empty((6, 6))
+    _quadratic(J, A_inv, n, Lambda_inv)
+    P = np.empty((m, 3))
+    _place_points(Rj, tj, link, local, P)
+    Jp = np.zeros((m, 3, n))
+    _point_jacobians(Jw, iv, chain, link, P, Jp)
+    B = np.empty((m, 3, 3))
+    for i in range(m):
+        _quadratic(Jp[i], A_inv, _used(chain, link[i]), B[i])
+    return A, A_inv, h, g, x, R, J, Jdqd, P, Jp, B, Lambda_inv
+
+
+@njit(cache=True, fastmath=False)
+def acceleration(A_inv: F64, tau: F64, h: F64, g: F64, viscous: F64, qd: F64) -> F64:
+    """Return qdd (n,) = A^-1 (tau - h - g - B qd), what a torque tau [Nm] makes of a state; NaN where a state is none.
+
+    h, g: (n,) [Nm]; viscous: (n,) [Nms/rad] friction B of the joints; qd: (n,) [rad/s].
+    """
+    out = np.zeros(tau.shape[0])
+    for j in range(tau.shape[0]):
+        net = tau[j] - h[j] - g[j] - viscous[j] * qd[j]
+        for i in range(tau.shape[0]):
+            out[i] += A_inv[i, j] * net
+    return out
+
+
+class RigidBody:
+    """One arm: Pinocchio's model reduced to the configured joints, its scratch data and views into it.
+
+    Links are numbered 0 = base and everything fixed to it, i = whatever joint i-1 of `names` carries.
+    """
+
+    def __init__(self, model: Any, geometry: Any, names: Sequence[str], tip_frame: str) -> None:
+        self.model, self.geometry, self.names = model, geometry, tuple(names)
+        self.data: Any = model.createData()
+        joints = [model.getJointId(name) for name in self.names]
+        n = len(joints)
+        self._iq: I64 = np.array([model.idx_qs[j] for j in joints], dtype=np.int64)
+        self._iv: I64 = np.array([model.idx_vs[j] for j in joints], dtype=np.int64)
+        self._circular: I64 = np.array([k for k in range(n) if model.nqs[joints[k]] == 2], dtype=np.int64)
+        self._direct = bool(model.nq == n and (self._iq == np.arange(n)).all())
+        # parent[link], link numbering; every other joint was locked, so a parent is the base or a configured joint
+        link_of = {0: 0} | {joint: k + 1 for k, joint in enumerate(joints)}
+        self.parent: I64 = np.array([0] + [link_of[model.parents[j]] for j in joints], dtype=np.int64)
+        self.chain: B1 = np.zeros((n + 1, n), dtype=np.bool_)  # [link, joint]: the joint moves the link
+        for k in range(1, n + 1):
+            ancestor = k
+            while ancestor:
+                self.chain[k, ancestor - 1] = True
+                ancestor = int(self.parent[ancestor])
+        self.link_of = link_of  # Pinocchio's joint id -> link
+        frame = model.frames[model.getFrameId(tip_frame)]
+        self.tip_link = link_of[frame.parentJoint]
+        self._tip_R: F64 = np.ascontiguousarray(frame.placement.rotation)
+        self._tip_t: F64 = np.ascontiguousarray(frame.placement.translation)
+        self._bind(joints)
+
+    def _bind(self, joints: list[int]) -> None:
+        """Hold views of Pinocchio's results: fetching them anew costs more than the arithmetic."""
+        data = self.data
+        self._terms = (data.M, data.nle, data.g, data.J, data.dJ)
+        placements = [data.oMi[j] for j in [0, *joints]]
+        self._views = [(k, oMi.rotation, oMi.translation) for k, oMi in enumerate(placements)]
+        self._Rj, self._tj = np.zeros((len(placements), 3, 3)), np.zeros((len(placements), 3))
+        self._Rj[0] = np.eye(3)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.names)
+
+    @property
+    def limits(self) -> JointLimits:
+        """Joint limits from the URDF; a continuous joint has none."""
+        model = self.model
+        q_min, q_max = np.array(model.lowerPositionLimit)[self._iq], np.array(model.upperPositionLimit)[self._iq]
+        q_min[self._circular], q_max[self._circular] = -np.inf, np.inf
+        return JointLimits(q_min, q_max, np.array(model.velocityLimit)[self._iv], np.array(model.effortLimit)[self._iv])
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | Path,
+        joint_names: Sequence[str],
+        tip_frame: str,
+        base_pose: F64,
+        armature: F64 | None = None,
+        package_dirs: Sequence[str | Path] = (),
+    ) -> "RigidBody":
+        """Read an arm from a URDF; joints that are not named are locked at zero.
+
+        joint_names: order of every (n,) array. base_pose: (4, 4) X_WB, pose of the URDF's root in the world.
+        armature: (n,) [kg m2] reflected rotor inertia added to A's diagonal, None is zero. package_dirs: what
+        package:// in mesh names resolves against. Raises ConfigError.
+        """
+        place = str(urdf)
+        if not Path(urdf).is_file():
+            raise ConfigError(place, "no such file", "a URDF")
+        try:
+            full = pin.buildModelFromUrdf(place)
+            geometry = pin.buildGeomFromUrdf(
+                full, place, pin.GeometryType.COLLISION, package_dirs=[str(d) for d in package_dirs]
+            )
+        except (ValueError, RuntimeError) as fault:
+            raise ConfigError(place, str(fault).splitlines()[0], "a URDF whose collision meshes can be found") from None
+        _check_names(place, full, joint_names, tip_frame)
+        locked = [j for j in range(1, full.njoints) if full.names[j] not in joint_names]
+        model, geometry = pin.buildReducedModel(full, geometry, locked, pin.neutral(full))
+        _move_base(model, geometry, base_pose)
+        body = cls(model, geometry, joint_names, tip_frame)
+        if armature is not None:
+            inertia = np.zeros(model.nv)
+            inertia[body._iv] = armature
+            model.armature = inertia
+        _check_inertia(place, body)
+        return body
+
+    def configuration(self, q: F64) -> F64:
+        """Return Pinocchio's configuration vector; a continuous joint is a point on the unit circle there."""
+        if self._direct:
+            return q
+        full: F64 = np.zeros(self.model.nq)
+        full[self._iq] = q
+        for k in self._circular:
+            full[self._iq[k]], full[self._iq[k] + 1] = np.cos(q[k]), np.sin(q[k])
+        return full
+
+    def _velocity(self, qd: F64) -> F64:
+        full: F64 = np.zeros(self.model.nv)
+        full[self._iv] = qd
+        return full
+
+    def evaluate(self, q: F64, qd: F64, points: Points, own: Own | None = None) -> Model:
+        """Return every term of the law at one state: A(q) qdd + h(q, qd) + g(q) = tau, and J, Jdqd, PSPs.
+
+        q, qd: (n,) [rad, rad/s]. The result shares no memory with this object.
+        """
+        pin.computeAllTerms(self.model, self.data, self.configuration(q), self._velocity(qd))
+        Rj, tj = self._Rj, self._tj
+        for k, R, t in self._views:
+            Rj[k], tj[k] = R, t
+        M, nle, gravity, Jw, dJw = self._terms
+        terms = _assemble(
+            M, nle, gravity, Jw, dJw, Rj, tj, qd, self._iv, self.chain, self.tip_link, self._tip_R, self._tip_t,
+            points.link, points.local,
+        )  # fmt: skip
+        rho, rows = own.measure(Rj, tj, Jw, self._iv, self.chain) if own else (np.zeros(0), np.zeros((0, self.n)))
+        return Model(q.copy(), qd.copy(), *terms, rho, rows)
+
+    def placed(self, q: F64, points: Points) -> F64:
+        """Return the PSPs (m, 3) [m] at q (n,), and nothing else: a planner asks thousands of times."""
+        pin.forwardKinematics(self.model, self.data, self.configuration(q))
+        for k, R, t in self._views:
+            self._Rj[k], self._tj[k] = R, t
+        P = np.empty((len(points.link), 3))
+        _place_points(self._Rj, self._tj, points.link, points.local, P)
+        return P
+
+    def own_distances(self, q: F64, own: Own) -> F64:
+        """Return the distances (L,) [m] of the watched pairs at q (n,), inf beyond `own.reach`."""
+        pin.computeJointJacobians(self.model, self.data, self.configuration(q))
+        for k, R, t in self._views:
+            self._Rj[k], self._tj[k] = R, t
+        return own.measure(self._Rj, self._tj, self._terms[3], self._iv, self.chain)[0]
+
+
+def _check_names(place: str, model: Any, joint_names: Sequence[str], tip_frame: str) -> None:
+    """Refuse joints and frames the URDF does not have, and joints of more than one degree of freedom."""
+    movable = [name for name, nv in zip(model.names, model.nvs, strict=True) if nv == 1]
+    for k, name in enumerate(joint_names):
+        if name not in movable:
+            raise ConfigError(f"{place}: joint", name, f"one of {', '.join(movable)}")
+        if name in joint_names[:k]:
+            raise ConfigError(f"{place}: joint", f"{name} twice", "each joint once")
+    if not joint_names:
+        raise ConfigError(f"{place}: joints", "none", f"some of {', '.join(movable)}")
+    frames = [frame.name for frame in model.frames]
+    if tip_frame not in frames:
+        raise ConfigError(f"{place}: tip_frame", tip_frame, f"one of {', '.join(frames)}")
+
+
+def _move_base(model: Any, geometry: Any, base_pose: F64) -> None:
+    """Put the root at X_WB: whatever hangs on the universe moves, gravity stays along the world's -z."""
+    X = pin.SE3(np.asarray(base_pose, dtype=np.float64))
+    for j in range(1, model.njoints):
+        if model.parents[j] == 0:
+            model.jointPlacements[j] = X * model.jointPlacements[j]
+    for frame in model.frames:
+        if frame.parentJoint == 0 and frame.name != "universe":
+            frame.placement = X * frame.placement
+    for thing in geometry.geometryObjects:
+        if thing.parentJoint == 0:
+            thing.placement = X * thing.placement
+
+
+def _check_inertia(place: str, body: RigidBody) -> None:
+    """Refuse a URDF whose mass matrix is singular: a massless last link makes every torque infinite."""
+    A = np.array(pin.crba(body.model, body.data, pin.neutral(body.model)))
+    eigenvalues = np.linalg.eigvalsh(np.triu(A) + np.triu(A, 1).T)
+    if not np.isfinite(A).all() or eigenvalues[0] <= 1e-9 * eigenvalues[-1]:
+        raise ConfigError(f"{place}: inertia", f"mass matrix eigenvalues from {eigenvalues[0]:.2g}", "positive")

@@ -1,0 +1,74 @@
+"""The robot as the tick sees it: constants alone, SI, derived from one config file by `config.build`."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtctl.arm.estimator import Design, EstimatorParams, JointParams
+from rtctl.arm.faults import SafetyParams
+from rtctl.arm.field import Field, FieldParams, LimitParams
+from rtctl.arm.model import RigidBody
+from rtctl.arm.osc import MotionParams
+from rtctl.arm.points import Coverage, Points
+from rtctl.arm.self_collision import Own
+from rtctl.types import F64, Record, Shape, Task
+from rtctl.world.meshes import NONE, Meshes
+
+JOINTS_MAX = 15  # of any arm: motor ids have four bits
+SLOTS = 64  # obstacle slots: the size of every array over obstacles
+
+
+class StopParams(NamedTuple):
+    """How the arm is brought to rest when it must stop."""
+
+    damping: F64  # (n,) [Nms/rad] D of the damped stop -D qd + g(q): A_ii(home) times the rate of decay
+    time: float  # [s] a damped stop cuts torque after this at the latest
+    frames: int  # disable frames sent at start and at the end
+    stall: float  # [s] at rest short of the goal before it is diagnosed
+
+
+class Robot(NamedTuple):
+    """Everything `tick` may know of the arm that does not change."""
+
+    name: str
+    n: int
+    joints: tuple[str, ...]
+    slots: int  # obstacle slots K
+    dt: float  # [s] servo period
+    model_dt: float  # [s] period of the parameter evaluation, >= dt
+    q_min: F64  # (n,) [rad]
+    q_max: F64  # (n,) [rad]
+    qd_max: F64  # (n,) [rad/s]
+    tau_max: F64  # (n,) [Nm] that may be sent: torque_ratio of the rating
+    tau_rated: F64  # (n,) [Nm] rating of the joint
+    tau_rate: F64  # (n,) [Nm/s]
+    tau_lsb: F64  # (n,) [Nm] rounding of the torque a drive echoes
+    viscous: F64  # (n,) [Nms/rad] friction of the joints, for predictions alone: it damps, so it is not compensated
+    braking: F64  # (n,) [rad/s2] with which a joint is brought to rest before its limit
+    home: F64  # (n,) [rad]
+    q_rest: F64  # (n,) [rad] of the posture task
+    base: F64  # (3,) [m] base in the world
+    reach: float  # [m] no point of the tip can be further from the base
+    body: RigidBody  # evaluates the model; keeps scratch memory, no state
+    points: Points
+    coverage: Coverage
+    own: Own  # hulls and pairs of links that can meet; no pairs when self-collision is off
+    obstacles: tuple[Shape, ...]  # of the config, always there
+    motion: MotionParams
+    avoid: FieldParams
+    escape: bool  # circulate around what holds the arm short of its goal
+    self_avoid: FieldParams
+    limit: LimitParams
+    estimator: EstimatorParams  # noise of the tip filter
+    tip_design: Design  # its steady state
+    joint_filter: JointParams  # noise of the joint filters
+    joint_P: F64  # (n, 2, 2) their steady covariance
+    safety: SafetyParams
+    stop: StopParams
+    scratch: Field  # work arrays of the field, overwritten every tick
+    tolerance: float  # [m] of a goal that gives none
+    tolerance_rot: float  # [rad]
+    axes: Task = Task.POSE  # of the tip that the arm can move
+    meshes: Meshes = NONE  # that obstacles may refer to
+    carry: bool = True  # tip and points are estimated between evaluations; else held still
+    constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`

@@ -1,0 +1,337 @@
+"""A checked config into the derived `Robot`: URDF, field gains, zones, noises; conversion to SI happens here alone."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtctl.arm.encoders import SHARE
+from rtctl.arm.estimator import JointParams
+from rtctl.arm.faults import SafetyParams
+from rtctl.arm.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
+from rtctl.arm.law import prepared
+from rtctl.arm.model import RigidBody
+from rtctl.arm.osc import MotionParams
+from rtctl.arm.points import Coverage, Points
+from rtctl.arm.robot import SLOTS, Robot, StopParams
+from rtctl.arm.self_collision import Own, nothing
+from rtctl.design import points as psp
+from rtctl.design.assets import Assets, load_assets, placed
+from rtctl.design.filters import design, design_joint, tip_params
+from rtctl.design.mobility import mobility
+from rtctl.design.pairs import watched
+from rtctl.errors import ConfigError
+from rtctl.kernel.rotations import R_of
+from rtctl.spec import rules
+from rtctl.spec.goal import task_of
+from rtctl.spec.obstacles import Obstacle, quaternion, shape_of
+from rtctl.spec.read import name_place
+from rtctl.spec.robot import Config
+from rtctl.spec.urdf import package_folders, urdf_file
+from rtctl.types import F64, Shape
+from rtctl.world.primitives import distance
+
+POSTURES = 256  # sampled for torque and inertia extremes
+FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
+VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
+P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
+
+
+class Extremes(NamedTuple):
+    """Largest values over sampled postures within the joint limits, and those at home."""
+
+    gravity: F64  # (n,) [Nm] largest |g_i|
+    gravity_home: F64  # (n,) [Nm] |g_i|
+    inertia: F64  # (n,) [kg m2] largest A_ii
+    inertia_home: F64  # (n,) [kg m2] A_ii
+
+
+def build(config: Config, path: str | Path) -> Robot:
+    """Return the robot of a checked config; `path` is its file, against which a relative URDF is looked for.
+
+    Raises ConfigError where URDF and config contradict each other or the points leave a link uncovered.
+    """
+    source, joints = str(path), config.robot.joints
+    body = _body(config, Path(path))
+    _refuse_limits(config, body, source)
+    home = np.array(config.robot.home_rad)
+    found = extremes(config, body)
+    _refuse_torque(config, found, source)
+    _refuse_axes(config, body, source)
+    points, coverage, own = _geometry(config, body, home, source)
+    assets = load_assets(config.mesh, config.obstacle, Path(path))
+    obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
+    _refuse_contact(obstacles, assets, body, points, home, source)
+    rest = config.motion.posture.q_rest_rad
+    tau_rated = np.array([j.tau_max_Nm for j in joints])
+    robot = Robot(
+        name=config.robot.name,
+        n=len(joints),
+        joints=tuple(j.name for j in joints),
+        slots=SLOTS,
+        dt=1.0 / config.loop.servo_hz,
+        model_dt=1.0 / config.loop.model_hz,
+        q_min=np.array([j.q_min_rad for j in joints]),
+        q_max=np.array([j.q_max_rad for j in joints]),
+        qd_max=np.array([j.qd_max_rad_s for j in joints]),
+        tau_max=config.safety.torque_ratio * tau_rated,
+        tau_rated=tau_rated,
+        tau_rate=np.array([j.tau_rate_Nm_s for j in joints]),
+        viscous=np.array([j.friction_Nms_rad for j in joints]),
+        tau_lsb=np.array([2.0 * s.t_max / (2**T_BITS - 1) for s in rules.scales(config)]),
+        braking=np.array([j.qd_max_rad_s for j in joints]) / config.avoid.joint_braking_s,
+        home=home,
+        q_rest=home.copy() if rest is None else np.array(rest),
+        base=np.array(config.robot.base_pose.position_m),
+        reach=_reach(config, body),
+        body=body,
+        points=points,
+        coverage=coverage,
+        own=own,
+        obstacles=obstacles,
+        meshes=assets.meshes,
+        motion=_motion(config),
+        avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
+        escape=config.avoid.escape,
+        self_avoid=_field(
+            config, config.avoid.self_influence_m, config.avoid.self_clearance_m, 1.0 / config.motion.singular_1_kg
+        ),
+        limit=_limit(config),
+        **_filters(config, body, home),
+        carry=config.estimator.carry,
+        safety=_safety(config, tau_rated),
+        stop=StopParams(
+            damping=config.safety.stop_damping * found.inertia_home,
+            time=config.safety.stop_s,
+            frames=config.safety.stop_frames,
+            stall=config.safety.stall_s,
+        ),
+        scratch=field_buffers(SLOTS, len(points.link), len(joints)),
+        tolerance=config.motion.tolerance_m,
+        tolerance_rot=config.motion.tolerance_rad,
+        axes=task_of(config.motion.axes),
+    )
+    return prepared(robot)
+
+
+def extremes(config: Config, body: RigidBody) -> Extremes:
+    """Return gravity torques and inertias over the same POSTURES every time: seeded, uniform within the limits."""
+    low = np.array([j.q_min_rad for j in config.robot.joints])
+    high = np.array([j.q_max_rad for j in config.robot.joints])
+    still, points = np.zeros(body.n), _no_points()
+    samples = np.random.default_rng(0).uniform(low, high, (POSTURES, body.n))
+    models = [body.evaluate(q, still, points) for q in (np.array(config.robot.home_rad), *samples)]
+    g = np.abs([m.g for m in models])
+    A = np.array([np.diag(m.A) for m in models])
+    return Extremes(g.max(axis=0), g[0], A.max(axis=0), A[0])
+
+
+def _body(config: Config, path: Path) -> RigidBody:
+    """Return the rigid body; complaints about the URDF are turned to name the key of the config."""
+    urdf = urdf_file(config.robot.urdf, path)
+    base = config.robot.base_pose
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R_of(quaternion(base.rpy_rad, base.wxyz)), base.position_m
+    names = [j.name for j in config.robot.joints]
+    armature = np.array([j.armature_kg_m2 for j in config.robot.joints])
+    try:
+        return RigidBody.from_urdf(urdf, names, config.robot.tip_frame, X, armature, package_folders(urdf))
+    except ConfigError as error:
+        what = error.place.rpartition(": ")[2]
+        if what == "joint" and error.got in names:
+            key = f"robot.joints[{names.index(str(error.got))}].name"
+        else:
+            key = "robot.tip_frame" if what == "tip_frame" else "robot.urdf"
+        raise ConfigError(name_place(str(path), key), error.got, f"{error.wanted} ({urdf.name})") from None
+
+
+def _refuse_limits(config: Config, body: RigidBody, source: str) -> None:
+    """Refuse joints that are given more range, speed or torque than the URDF states."""
+    limits = body.limits
+    for i, j in enumerate(config.robot.joints):
+        rows = [
+            ("q_min_rad", j.q_min_rad, j.q_min_rad >= limits.q_min[i] - 1e-6, f"at least {limits.q_min[i]:g}"),
+            ("q_max_rad", j.q_max_rad, j.q_max_rad <= limits.q_max[i] + 1e-6, f"at most {limits.q_max[i]:g}"),
+            (
+                "qd_max_rad_s",
+                j.qd_max_rad_s,
+                j.qd_max_rad_s <= limits.qd_max[i] * 1.000001,
+                f"at most {limits.qd_max[i]:g}",
+            ),
+            (
+                "tau_max_Nm",
+                j.tau_max_Nm,
+                j.tau_max_Nm <= limits.tau_max[i] * 1.000001,
+                f"at most {limits.tau_max[i]:g}",
+            ),
+        ]
+        for key, got, fine, wanted in rows:
+            if not fine:
+                place = name_place(source, f"robot.joints[{i}].{key}")
+                raise ConfigError(place, got, f"{wanted}, the URDF's limit of {j.name}")
+
+
+def _refuse_torque(config: Config, found: Extremes, source: str) -> None:
+    """Refuse a joint that cannot hold the arm at home with what may be sent, or anywhere with its rating."""
+    for i, j in enumerate(config.robot.joints):
+        usable = config.safety.torque_ratio * j.tau_max_Nm
+        place = name_place(source, f"robot.joints[{i}].tau_max_Nm")
+        if found.gravity_home[i] >= usable:
+            wanted = f"more than gravity's {found.gravity_home[i]:.3g} Nm at home / torque_ratio"
+            raise ConfigError(place, j.tau_max_Nm, wanted)
+        if found.gravity[i] >= j.tau_max_Nm:
+            raise ConfigError(place, j.tau_max_Nm, f"more than gravity's {found.gravity[i]:.3g} Nm within the limits")
+
+
+def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[Points, Coverage, Own]:
+    """Return PSPs, how well they cover the links, and the pairs of links that are watched."""
+    listed = config.avoid.points
+    try:
+        if isinstance(listed, str):
+            points, coverage = psp.place(body)
+        else:
+            points, coverage = psp.given(body, [(p.link, np.array(p.position_m), p.radius_m) for p in listed])
+    except ConfigError as error:  # its place is the key alone
+        raise ConfigError(name_place(source, error.place), error.got, error.wanted) from None
+    if isinstance(listed, str) and coverage.protrusion >= config.avoid.clearance_m:
+        place = name_place(source, "avoid.clearance_m")
+        wanted = f"more than the {coverage.protrusion:.3g} that the links protrude from their points"
+        raise ConfigError(place, config.avoid.clearance_m, wanted)
+    q_min, q_max = (np.array([getattr(j, key) for j in config.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
+    if config.avoid.self_collision:
+        # beyond the influence by what stops a link before it, and a little, that none comes there between evaluations
+        reach = config.avoid.self_influence_m + 0.02 + rules.braking_distance(config)
+        own = watched(body, q_min, q_max, home, config.avoid.self_influence_m, reach)
+    else:
+        own = nothing()
+    return points, coverage, own
+
+
+def loaded_shape(obstacle: Obstacle, assets: Assets) -> Shape:
+    """Return the obstacle as the controller takes it, a cloud with its points."""
+    shape = shape_of(obstacle)
+    return placed(shape, assets.clouds[obstacle.name]) if obstacle.name in assets.clouds else shape
+
+
+def _refuse_contact(
+    obstacles: tuple[Shape, ...], assets: Assets, body: RigidBody, points: Points, home: F64, source: str
+) -> None:
+    """Refuse an obstacle of the config that the arm touches at home."""
+    P = body.evaluate(home, np.zeros(body.n), points).P
+    for i, shape in enumerate(obstacles):
+        rho = distance(shape, P, assets.meshes)[0] - points.radius
+        if rho.min() <= 0.0:
+            place = name_place(source, f"obstacle[{i}].position_m")
+            got = f"{shape.name} {-rho.min():.3g} m inside the points of {points.names[int(rho.argmin())]} at home"
+            raise ConfigError(place, got, "an obstacle clear of the arm at home")
+
+
+def _reach(config: Config, body: RigidBody) -> float:
+    """Return the sum [m] of the distances between neighbouring joints up to the tip: a bound that no posture passes."""
+    model = body.model
+    frame = model.frames[model.getFrameId(config.robot.tip_frame)]
+    total, joint = float(np.linalg.norm(frame.placement.translation)), frame.parentJoint
+    base = np.array(config.robot.base_pose.position_m)
+    while joint != 0:
+        t, parent = np.array(model.jointPlacements[joint].translation), model.parents[joint]
+        total += float(np.linalg.norm(t - base if parent == 0 else t))
+        joint = parent
+    return total
+
+
+def _refuse_axes(c: Config, body: RigidBody, source: str) -> None:
+    """Raise ConfigError for an axis of the task along or about which the tip never moves."""
+    q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
+    never = mobility(body, q_min, q_max)
+    for i, axis in enumerate(c.motion.axes):
+        lost = never.unturned if axis.startswith("r") else never.still
+        if np.linalg.norm(lost[:, "xyz".index(axis[-1])]) > 1.0 - 1e-6:
+            place = name_place(source, f"motion.axes[{i}]")
+            raise ConfigError(place, axis, "an axis along (x) or about (rx) which this arm can move")
+
+
+def _motion(c: Config) -> MotionParams:
+    m, p = c.motion, c.motion.posture
+    return MotionParams(
+        k_p=m.stiffness,
+        k_v=2.0 * m.damping_ratio * float(np.sqrt(m.stiffness)),
+        v_max=m.v_max_m_s,
+        a_max=m.a_max_m_s2,
+        w_max=m.w_max_rad_s,
+        alpha_max=m.alpha_max_rad_s2,
+        k_q=p.stiffness,
+        d_q=p.damping,
+        qdd_posture=p.damping * p.speed_ratio * np.array([j.qd_max_rad_s for j in c.robot.joints]),
+        epsilon=m.singular_1_kg,
+        length=m.length_m,
+        speed_margin=m.joint_speed_ratio,
+    )
+
+
+def _field(c: Config, rho0: float, rho_min: float, m_max: float) -> FieldParams:
+    dt = 1.0 / c.loop.servo_hz
+    return field_params(c.motion.v_max_m_s, rho0, rho_min, dt, c.avoid.damping_ratio, c.avoid.lookahead_s, m_max)
+
+
+def _limit(c: Config) -> LimitParams:
+    n, dt = len(c.robot.joints), 1.0 / c.loop.servo_hz
+    speed = np.array([rules.joint_speed(c, i) for i in range(n)])
+    zone, clearance = np.full(n, c.avoid.joint_influence_rad), np.full(n, c.avoid.joint_clearance_rad)
+    return limit_params(speed, zone, clearance, dt, c.avoid.damping_ratio)
+
+
+def _filters(c: Config, body: RigidBody, home: F64) -> dict[str, Any]:
+    """Return the filters' noises and steady states: quantisation of the drives, seen at the tip through J at home."""
+    e, n, dt = c.estimator, body.n, 1.0 / c.loop.servo_hz
+    scales = rules.scales(c)
+    # a quantised value is uniform within its step: standard deviation step/sqrt(12)
+    lsb_p = np.array([2.0 * s.p_max / (2**P_BITS - 1) for s in scales])
+    lsb_v = np.array([2.0 * s.v_max / (2**V_BITS - 1) for s in scales])
+    joint_filter = JointParams(
+        sigma_qdd=np.full(n, e.joint_acceleration_rad_s2),
+        r_q=np.hypot(lsb_p / np.sqrt(12.0), e.position_noise_rad),
+        r_qd=np.hypot(lsb_v / np.sqrt(12.0), e.velocity_noise_rad_s),
+        has_qd=e.joint_velocity,
+    )
+    kinds, of = np.unique(np.stack(joint_filter[:3], axis=1), axis=0, return_inverse=True)  # equal drives, one design
+    joint_P = design_joint(JointParams(kinds[:, 0], kinds[:, 1], kinds[:, 2], e.joint_velocity), dt, dt)[of.ravel()]
+    J = body.evaluate(home, np.zeros(n), _no_points()).J
+    tip = tip_params(J, joint_P, e.acceleration_m_s2, e.acceleration_rad_s2)
+    ratio = max(1, round(c.loop.servo_hz / c.loop.model_hz))
+    return {
+        "estimator": tip,
+        "tip_design": design(tip, dt, ratio, 0.0),  # joints are predicted to now, so a pose has no age
+        "joint_filter": joint_filter,
+        "joint_P": joint_P,
+    }
+
+
+def _safety(c: Config, tau_rated: F64) -> SafetyParams:
+    s, period = c.safety, 1000.0 / c.loop.servo_hz  # [ms]
+    return SafetyParams(
+        stale_periods=int(s.stale_hold_ms / period + 1e-9),
+        lost_periods=int(s.stale_stop_ms / period + 1e-9),
+        torque_tolerance=s.torque_error_ratio * tau_rated,
+        friction=FRICTION * s.torque_error_ratio * tau_rated,
+        velocity_tolerance=_velocity_tolerance(c),
+        speed_tolerance=s.speed_ratio,
+        limit_tolerance=s.limit_excess_rad,
+        innovation_max=c.estimator.innovation_sigma,
+        feed_timeout=s.obstacle_stale_s,
+        creep=c.avoid.obstacle_speed_m_s,
+    )
+
+
+def _velocity_tolerance(c: Config) -> F64:
+    """Return the bound (n,) [rad/s] of positions against speed: a share of qd_max, and what rounding leaves."""
+    if not c.estimator.joint_velocity:
+        return np.full(len(c.robot.joints), np.finfo(np.float64).max)  # they report no speed worth comparing
+    step = np.array([2.0 * s.p_max / (2**P_BITS - 1) for s in rules.scales(c)])
+    noise = np.hypot(step, c.estimator.position_noise_rad) * c.loop.servo_hz
+    qd_max = np.array([j.qd_max_rad_s for j in c.robot.joints])
+    bound: F64 = VELOCITY_SHARE * qd_max + 2.0 * SHARE * noise
+    return bound
+
+
+def _no_points() -> Points:
+    return Points(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), ())

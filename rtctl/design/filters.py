@@ -1,0 +1,74 @@
+"""The filters' noise and steady states, found once when a robot is built."""
+
+import math
+
+import numpy as np
+
+from rtctl.arm.estimator import Design, EstimatorParams, JointParams
+from rtctl.types import F64
+
+
+def tip_params(J: F64, P: F64, sigma_a: float, sigma_alpha: float) -> EstimatorParams:
+    """Return the tip filter's noise from the joint filters' covariance, the worst axis i of sum_k J_ik^2 var_k.
+
+    J: (6, n) at a typical configuration, such as home. P: (n, 2, 2) from `design_joint`. sigma_a [m/s2]: what F* does
+    not explain of the tip's acceleration; sigma_alpha [rad/s2].
+    """
+    variance = [[sum(J[i, k] ** 2 * P[k, d, d] for k in range(len(P))) for i in range(6)] for d in range(2)]
+    worst = [[math.sqrt(max(row[:3])), math.sqrt(max(row[3:]))] for row in variance]
+    return EstimatorParams(sigma_a, sigma_alpha, worst[1][0], worst[1][1], worst[0][0], worst[0][1])
+
+
+def design(params: EstimatorParams, dt: float, ratio: int, age: float) -> Design:
+    """Return the tip filter's steady state, found by running filterpy's filter until it repeats.
+
+    dt [s]: servo period, a velocity update each. ratio: servo periods per pose update. age [s] of a pose.
+    """
+    Q, P, velocity, pose = _steady(params.sigma_a, params.r_v, params.r_x, dt, ratio, age, True)
+    Q_rot, P_rot, velocity_rot, pose_rot = _steady(
+        params.sigma_alpha, params.r_omega, params.r_rot, dt, ratio, age, True
+    )
+    return Design(Q, Q_rot, P, P_rot, velocity, velocity_rot, pose, pose_rot)
+
+
+def design_joint(params: JointParams, dt: float, age: float) -> F64:
+    """Return the joint filters' steady covariance (n, 2, 2), found by running filterpy's filter until it repeats.
+
+    dt [s]: servo period. age [s] of a reply when it is used: one period.
+    """
+    rows = zip(params.sigma_qdd, params.r_q, params.r_qd, strict=True)
+    return np.array([_steady(s, r_qd, r_q, dt, 1, age, params.has_qd)[1] for s, r_q, r_qd in rows]).reshape(-1, 2, 2)
+
+
+def _steady(
+    sigma: float, r_v: float, r_x: float, dt: float, ratio: int, age: float, has_velocity: bool
+) -> tuple[F64, F64, F64, F64]:
+    """Return Q, P and the two gains of one axis once a cycle of updates leaves its covariance as it was."""
+    # Imported here: it takes a second, and only a build needs it.
+    from filterpy.common import Q_discrete_white_noise
+    from filterpy.kalman import KalmanFilter
+
+    axis = KalmanFilter(dim_x=2, dim_z=1)
+    axis.F = np.array([[1.0, dt], [0.0, 1.0]])
+    axis.Q = Q_discrete_white_noise(2, dt, sigma * sigma)
+    axis.P = np.diag([r_x * r_x, r_v * r_v])
+    gain_velocity = np.zeros(2)
+    for _ in range(20_000):
+        before = axis.P.copy()
+        for k in range(ratio):
+            axis.predict()
+            if has_velocity:
+                axis.update(0.0, R=r_v * r_v, H=np.array([[0.0, 1.0]]))
+                gain_velocity = axis.K[:, 0].copy()
+            if k == ratio - 1:
+                axis.update(0.0, R=r_x * r_x, H=np.array([[1.0, -age]]))
+                gain_pose = axis.K[:, 0].copy()
+        if np.allclose(axis.P, before, rtol=1e-10, atol=0.0):
+            break
+    # Rounded: filterpy's BLAS differs in the last bits from one processor to another, an estimate must not.
+    return axis.Q, _round(axis.P), _round(gain_velocity), _round(gain_pose)
+
+
+def _round(values: F64) -> F64:
+    """Return values to nine significant digits."""
+    return np.array([float(f"{v:.8e}") for v in values.flat]).reshape(values.shape)

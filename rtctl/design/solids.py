@@ -1,0 +1,123 @@
+"""Collision geometry as convex pieces: their corners, faces, depth below the surface.
+
+A mesh is taken by its hull, which is also what physics engines collide with. A round shape is replaced by a
+polyhedron that contains it, a little larger: 1.7 % for a sphere.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from rtctl.arm.model import RigidBody
+from rtctl.errors import ConfigError
+from rtctl.types import F64, I64
+
+EDGE = 0.012  # [m] longest edge of a surface triangle
+STEP = 1e-5  # [m] lengths are rounded to it, so that rounding errors cannot change a choice
+_SIDES = 24  # of the polygons that stand for circles
+
+
+class Solid(NamedTuple):
+    """One convex piece of collision geometry in the frame of the joint that carries it."""
+
+    link: int
+    name: str  # URDF link
+    corners: F64  # (v, 3) [m]
+    faces: I64  # (f, 3) corner indices
+    planes: F64  # (p, 4) outward unit normal and offset: n.x + d <= 0 inside
+
+
+def solids_of(body: RigidBody) -> list[Solid]:
+    """Return the convex pieces of the collision geometry, in the order of the URDF."""
+    solids = []
+    for thing in body.geometry.geometryObjects:
+        local = _corners(thing.geometry, str(thing.name))
+        X = thing.placement
+        corners = local @ np.array(X.rotation).T + np.array(X.translation)
+        name = body.model.frames[thing.parentFrame].name
+        try:
+            hull = ConvexHull(corners)
+        except QhullError:
+            raise ConfigError(f"collision geometry {thing.name}", "a flat or degenerate mesh", "a solid") from None
+        solids.append(
+            Solid(
+                body.link_of[thing.parentJoint], name, corners, hull.simplices.astype(np.int64), hull.equations.copy()
+            )
+        )
+    return solids
+
+
+def _corners(shape: Any, name: str) -> F64:
+    """Return the corners of a polyhedron that contains a collision shape (itself, for a flat-faced one)."""
+    if isinstance(shape, coal.BVHModelBase):
+        return np.array(shape.vertices(), dtype=np.float64)
+    if isinstance(shape, coal.ConvexBase):
+        return np.array(shape.points(), dtype=np.float64)
+    if isinstance(shape, coal.Box):
+        signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64)
+        return np.asarray(signs * np.array(shape.halfSide))
+    if isinstance(shape, coal.Sphere):
+        return _ball(shape.radius)
+    if isinstance(shape, coal.Capsule):
+        return _at_both_ends(_ball(shape.radius), shape.halfLength)
+    if isinstance(shape, coal.Cylinder):
+        return _at_both_ends(_ring(shape.radius), shape.halfLength)
+    raise ConfigError(f"collision geometry {name}", type(shape).__name__, "a mesh, box, sphere, capsule or cylinder")
+
+
+def _at_both_ends(corners: F64, half_length: float) -> F64:
+    """Return corners shifted along z to both ends of an axis: their hull is the shape swept along it."""
+    shift = np.array([0.0, 0.0, half_length])
+    return np.concatenate([corners - shift, corners + shift])
+
+
+def _ring(radius: float) -> F64:
+    """Return a regular polygon circumscribed about a circle in the xy plane."""
+    t = np.arange(_SIDES) * (2.0 * math.pi / _SIDES)
+    return np.column_stack([np.cos(t), np.sin(t), np.zeros(_SIDES)]) * (radius / math.cos(math.pi / _SIDES))
+
+
+def _ball(radius: float) -> F64:
+    """Return the corners of a polyhedron around a sphere: rings on the circles of latitude, and the poles."""
+    grow = 1.0 / math.cos(math.pi / _SIDES)
+    rows = [np.array([[0.0, 0.0, z * radius * grow]]) for z in (-1.0, 1.0)]
+    for k in range(1, _SIDES // 2):
+        phi = 2.0 * math.pi * k / _SIDES
+        rows.append(_ring(radius * grow * math.sin(phi)) + np.array([0.0, 0.0, radius * grow * math.cos(phi)]))
+    return np.concatenate(rows)
+
+
+def surface(solid: Solid, edge: float = EDGE) -> tuple[F64, I64]:
+    """Return a solid's surface as small triangles: samples (s, 3) and their indices (t, 3)."""
+    triangles = solid.corners[solid.faces]  # (t, 3 corners, 3)
+    done = []
+    while len(triangles):
+        edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
+        long = edges.max(axis=1) > edge
+        done.append(triangles[~long])
+        triangles, edges = triangles[long], edges[long]
+        # turn each so that its longest edge is corner 0 to corner 1, then halve that edge
+        first = np.argmax(edges, axis=1)
+        rows = np.arange(len(triangles))
+        p, q, r = (triangles[rows, (first + k) % 3] for k in range(3))
+        middle = 0.5 * (p + q)
+        triangles = np.concatenate([np.stack([p, middle, r], axis=1), np.stack([middle, q, r], axis=1)])
+    split = np.concatenate(done)
+    samples, index = np.unique(split.reshape(-1, 3), axis=0, return_inverse=True)
+    return samples, index.reshape(-1, 3).astype(np.int64)
+
+
+def areas(samples: F64, triangles: I64) -> F64:
+    p, q, r = (samples[triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(q - p, r - p), axis=1))
+
+
+def depth(solid: Solid, p: F64) -> F64:
+    """Return how deep points lie below a convex surface [m]: exact inside, negative outside."""
+    below: F64 = np.full(len(p), np.inf)
+    for nx, ny, nz, d in solid.planes:
+        np.minimum(below, -(p[:, 0] * nx + p[:, 1] * ny + p[:, 2] * nz + d), out=below)
+    return below

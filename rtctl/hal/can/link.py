@@ -1,0 +1,281 @@
+"""The link to the joint drives: commands out, exactly one reply of each joint back in every cycle.
+
+A reply has no time stamp that can be trusted, so its age is counted in slots of the grid: the drive took its sample
+when the command that it answers arrived, which is one slot ago on a healthy bus.
+"""
+
+import time
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from rtctl.protocol import batch, e2e, frame, mit
+from rtctl.types import F64, I64, Command, Drive, Feedback, Link, Transport
+
+MIT, MIT_E2E = "mit", "mit+e2e"
+_SPECIAL = {Drive.DISABLE: mit.DISABLE, Drive.ENABLE: mit.ENABLE, Drive.CLEAR: mit.CLEAR}
+_DUPLICATE, _DISORDER, _DOWN = int(Link.DUPLICATE), int(Link.DISORDER), int(Link.DOWN)  # a flag's & is slow
+_DERATED, _LESS = int(Link.DERATED), int(e2e.Report.CLAMPED | e2e.Report.DERATED)
+_REOPEN_S = 1.0  # [s] between attempts to open a bus that went away
+
+
+class JointSpec(NamedTuple):
+    """What the link needs to know of a joint; q_min and q_max [rad] are checked at the start only."""
+
+    name: str
+    can_id: int
+    scale: mit.Scale
+    q_min: float
+    q_max: float
+
+
+class LinkSpec(NamedTuple):
+    """What the link needs to know of the robot."""
+
+    place: str  # how the bus is named in errors, `can0`
+    joints: tuple[JointSpec, ...]
+    protocol: str  # MIT | MIT_E2E
+    fd: bool  # frames are CAN FD with bit-rate switch; MIT_E2E needs it
+    period: float  # [s] of the servo loop
+    watchdog: float  # [s] W: a drive that hears nothing for longer stops by itself
+
+
+def identifiers(joints: Iterable[JointSpec]) -> tuple[int, ...]:
+    """Return the identifiers a link listens to: the replies, and the commands that nobody else may send."""
+    ids = [joint.can_id for joint in joints]
+    return (*(i + mit.REPLY_OFFSET for i in ids), *ids, mit.REGISTER_ID)
+
+
+class CanLink:
+    """Owns a transport; knows the last good value of each joint."""
+
+    def __init__(self, spec: LinkSpec, transport: Transport) -> None:
+        n = len(spec.joints)
+        self.spec, self.transport = spec, transport
+        self.protected = spec.protocol == MIT_E2E
+        self.received: list[bytes] = []  # raw frames of the last read
+        self.corrupt = self.ignored = self.foreign = 0  # frames so far
+        self.bus_state = Link.NONE  # BUS_OFF or ERROR_PASSIVE while it lasts
+        self.pending: list[bytes] = []  # received ahead of the next read
+        self.receivers = [e2e.Receiver() for _ in range(n)]
+        self.restarted = True  # the next read comes right after a handshake
+        self._counters: I64 = np.zeros(n, np.int64)
+        self._length = e2e.LENGTH if self.protected else mit.LENGTH
+        self._size = frame.CANFD_MTU if spec.fd else frame.CAN_MTU
+        self._padding = bytes(self._size - 8 - self._length)
+        self._joint_of = {_word(joint.can_id + mit.REPLY_OFFSET): j for j, joint in enumerate(spec.joints)}
+        self._ours = frozenset(_word(i) for i in (*(joint.can_id for joint in spec.joints), mit.REGISTER_ID))
+        self._cycle = batch.cycle_of(
+            self.protected, spec.fd, tuple(j.can_id for j in spec.joints), tuple(j.scale for j in spec.joints)
+        )
+        batch.warm(self._cycle)
+        self._state: F64 = np.zeros((3, n))  # position, velocity, torque of the newest reply
+        self._codes: I64 = np.zeros((5, n), np.int64)  # drive status, two temperatures, counter, report
+        self._codes[0] = -1
+        self._replies: I64 = np.zeros(n, np.int64)
+        self._sampled: I64 = np.full(n, -1)
+        self._slot = -1
+        self._reopen_at = 0
+        self._flags = 0
+
+    @property
+    def status(self) -> list[int]:
+        """e2e.Report of each joint's newest reply."""
+        return [int(each) for each in self._codes[4]]
+
+    @property
+    def temperature(self) -> list[tuple[int, int]]:
+        """Temperature [degC] of each joint's driver and coil."""
+        return [(int(mos), int(coil)) for mos, coil in self._codes[1:3].T]
+
+    # ---- out
+
+    def encode(self, joint: int, payload: bytes, wanted: e2e.Wanted = e2e.Wanted.NONE, can_id: int = -1) -> bytes:
+        """Return the raw frame that carries 8 payload bytes to a joint, under its own identifier if none is given."""
+        can_id = self.spec.joints[joint].can_id if can_id < 0 else can_id
+        if self.protected:
+            counter = self._counters[joint] = (int(self._counters[joint]) + 1) & 0xFF
+            payload = e2e.protect(payload, counter, wanted, can_id)
+        return frame.HEAD.pack(can_id, self._length, frame.FD_FDF | frame.FD_BRS if self.spec.fd else 0) + (
+            b"\0\0" + payload + self._padding
+        )
+
+    @property
+    def counters(self) -> tuple[int, ...]:
+        """Return the counter of each joint's newest protected frame."""
+        return tuple(self._counters.tolist())
+
+    def set_counter(self, joint: int, counter: int) -> None:
+        """Go on counting a joint's protected frames behind `counter`: a replay takes up a log's count."""
+        self._counters[joint] = counter & 0xFF
+
+    def write(self, command: Command) -> list[bytes]:
+        """Send one frame to each joint, or drop it; return the raw frames that went out."""
+        special = _SPECIAL.get(command.drive)
+        if special is not None:
+            frames = [self.encode(j, special) for j in range(len(self.spec.joints))]
+        else:
+            frames = batch.encode(self._cycle, command.tau, self._counters)
+        return self.transport.send_all(frames)
+
+    # ---- in
+
+    def read(self, slot: int, missed: int, lateness: float, compute: float) -> Feedback:
+        """Drain the bus and return what is known at `slot`; `lateness` and `compute` [s] are passed on for the log."""
+        self._flags = 0
+        asked = slot - 1 if self.restarted else self._slot  # the slot of the commands that are answered now
+        self._slot, self.restarted = slot, False
+        self.received = [*self.pending, *self.transport.receive()]
+        self.pending = []
+        if not self._take_whole(asked):
+            self._take_each(asked)
+        self._flags |= self.transport.flags() | int(self.bus_state)
+        if self.protected and int(np.bitwise_or.reduce(self._codes[4])) & _LESS:
+            self._flags |= _DERATED
+        if self._flags & _DOWN:
+            self._reopen(slot)
+        q, qd, tau = self._state.copy()
+        age = np.multiply(slot - self._sampled, self.spec.period, dtype=np.float64)
+        return Feedback(
+            slot,
+            missed,
+            q,
+            qd,
+            tau,
+            age,
+            self._replies.copy(),
+            self._codes[0].copy(),
+            int(self._flags),
+            lateness,
+            compute,
+        )
+
+    def joint_of(self, raw: bytes) -> int | None:
+        """Return the joint that a raw frame is a reply of, or None."""
+        return self._joint_of.get(raw[:4])
+
+    def payload(self, joint: int, raw: bytes) -> bytes | None:
+        """Return the data of a joint's reply, or None if its kind, length or CRC is wrong."""
+        if len(raw) != self._size or raw[4] != self._length:
+            return None
+        data = raw[8 : 8 + self._length]
+        if self.protected and not e2e.intact(data, self.spec.joints[joint].can_id + mit.REPLY_OFFSET):
+            return None
+        return data
+
+    def is_ours(self, raw: bytes) -> bool:
+        """True if a frame carries an identifier that only this program may send."""
+        return raw[:4] in self._ours
+
+    def _take_whole(self, asked: int) -> bool:
+        """Take a cycle in which all is as it should be; return False, with nothing taken, if anything is not."""
+        if any(receiver.disorder for receiver in self.receivers):
+            return False
+        got = batch.decode(self._cycle, self.received, [receiver.last for receiver in self.receivers])
+        if got is None or not got.whole:
+            return False
+        self._state, self._codes = got.state, got.codes
+        if self.protected:
+            for receiver, counter in zip(self.receivers, got.codes[3].tolist(), strict=True):
+                receiver.last = counter
+        self._replies.fill(1)
+        self._sampled.fill(asked)
+        return True
+
+    def _take_each(self, asked: int) -> None:
+        """Take what came, frame by frame."""
+        self._replies.fill(0)
+        for raw in self.received:
+            self._take(raw, asked)
+        if self._replies.max() > 1:
+            self._flags |= _DUPLICATE
+        if any(receiver.disorder == e2e.DISORDER_LIMIT for receiver in self.receivers):
+            self._flags |= _DISORDER
+
+    def _take(self, raw: bytes, asked: int) -> None:
+        joint = self._joint_of.get(raw[:4])
+        if joint is None:
+            self.take_stranger(raw)
+            return
+        spec = self.spec.joints[joint]
+        data = self.payload(joint, raw)
+        reply = None if data is None else mit.decode_reply(data[: mit.LENGTH], spec.scale)
+        if data is None or reply is None or reply.id != spec.can_id & 0xF:
+            self.corrupt += 1
+            self._flags |= Link.CORRUPT
+            return
+        if self.protected and not self._in_sequence(joint, data):
+            return
+        self._state[:, joint] = reply.p, reply.v, reply.t
+        self._codes[:3, joint] = reply.err, reply.t_mos, reply.t_rotor
+        self._sampled[joint] = asked
+        self._replies[joint] += 1
+
+    def _in_sequence(self, joint: int, data: bytes) -> bool:
+        received = self.receivers[joint].judge(data[8])
+        if received.check is e2e.Check.REPEATED:
+            self._flags |= Link.DUPLICATE
+        elif received.check is e2e.Check.WRONGSEQUENCE:
+            self._flags |= Link.SEQUENCE
+        if received.fresh:
+            self._codes[3:, joint] = data[8], data[9]
+        return received.fresh
+
+    def take_stranger(self, raw: bytes) -> None:
+        """Account for a frame that is no reply: an error report, a second master, or nothing to us."""
+        try:
+            one = frame.unpack(raw)
+        except ValueError:
+            self.corrupt += 1
+            self._flags |= Link.CORRUPT
+            return
+        if one.error:
+            self._note_error(one)
+        elif self.is_ours(raw):
+            self.foreign += 1
+            self._flags |= Link.FOREIGN_COMMAND
+        else:
+            self.ignored += 1
+
+    def _note_error(self, error: frame.Frame) -> None:
+        if error.can_id & frame.ERR_BUSOFF:
+            self.bus_state = Link.BUS_OFF
+        if error.can_id & frame.ERR_RESTARTED:
+            self.bus_state = Link.NONE
+        if error.can_id & frame.ERR_CRTL and len(error.data) > 1:
+            detail = error.data[1]
+            if detail & frame.CRTL_OVERFLOW:
+                self._flags |= Link.OVERFLOW
+            if detail & frame.CRTL_STATES and self.bus_state is not Link.BUS_OFF:
+                self.bus_state = Link.ERROR_PASSIVE if detail & frame.CRTL_PASSIVE else Link.NONE
+
+    def wait_replies(self, timeout: float) -> bool:
+        """Wait until each joint has replied to the last write, for lockstep; False after `timeout` [s] of silence."""
+        missing, deadline = set(range(len(self.spec.joints))), time.monotonic() + timeout
+        remaining = timeout
+        while remaining > 0.0:
+            frames = self.transport.collect(len(missing), timeout)
+            self.pending += frames
+            missing.difference_update(self._joint_of.get(raw[:4], -1) for raw in frames)
+            if not missing:
+                return True
+            if not frames:
+                return False
+            remaining = deadline - time.monotonic()
+        return False
+
+    def _reopen(self, slot: int) -> None:
+        if slot >= self._reopen_at:
+            self._reopen_at = slot + round(_REOPEN_S / self.spec.period)
+            if self.transport.reopen():
+                self.bus_state = Link.NONE
+
+    def close(self) -> None:
+        """Close the transport."""
+        self.transport.close()
+
+
+def _word(can_id: int) -> bytes:
+    """Return the first four bytes of a data frame with an 11-bit identifier."""
+    return frame.HEAD.pack(can_id, 0, 0)[:4]

@@ -1,0 +1,103 @@
+"""Following a log while it is written: what each new chunk of the growing file holds."""
+
+import io
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+from rtctl.errors import LogError
+from rtctl.log import schema
+from rtctl.log.mcap.segment import OPEN
+from rtctl.log.mcap.summary import MAGIC
+from rtctl.log.mcap.walk import MESSAGE, RECORD, Damaged, chunk_data, chunk_head, chunk_messages, walk
+from rtctl.log.read.reader import read
+from rtctl.log.read.topic import Part, Topic
+
+
+class News(NamedTuple):
+    """What a look at the file brought."""
+
+    ticks: np.ndarray[Any, np.dtype[np.void]]  # the records that are new; empty for another program's log
+    events: list[dict[str, Any]]
+    ended: dict[str, Any]  # the sentinel; {} while it is being written
+
+
+class Follower:
+    """Reads on where it stopped; goes over to the file's final name when its writer has closed it."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises LogError when the file is not there or no log."""
+        self.path = path
+        log = read(path)
+        self.header = log.header
+        self._at = len(MAGIC)
+        self._channels: dict[int, records.Channel] = {}
+
+    @property
+    def _file(self) -> Path:
+        done = self.path.with_name(self.path.name.removesuffix(OPEN))
+        return self.path if self.path.exists() else done
+
+    def news(self) -> News:
+        """Return what has been written since the last call. Raises LogError when the file has gone."""
+        try:
+            with self._file.open("rb") as file:
+                file.seek(self._at)
+                data = file.read()
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror}") from None
+        found: list[np.ndarray[Any, Any]] = []
+        events: list[dict[str, Any]] = []
+        ended: dict[str, Any] = {}
+        used = 0
+        for opcode, body, end in walk(data, 0, len(data)):
+            used = end
+            if opcode == Opcode.CHANNEL:
+                try:
+                    channel = records.Channel.read(ReadDataStream(io.BytesIO(data[body:end])))
+                except (McapError, struct.error, ValueError):
+                    continue
+                self._channels[channel.id] = channel
+            elif opcode == Opcode.CHUNK:
+                try:
+                    content = chunk_data(data, chunk_head(data, body, end))
+                except Damaged:
+                    continue
+                for channel_id, topic in self._topics(content):
+                    if topic.name == schema.TICK and topic.dtype is not None:
+                        found.append(topic.array)
+                    elif topic.name == schema.EVENT:
+                        events += [m.get("data", m) for m in topic.json]
+                    elif topic.name == schema.SENTINEL:
+                        ended = topic.json[-1]
+                    del channel_id
+        self._at += used
+        ticks = np.concatenate(found) if found else np.zeros(0, self.header.dtype)
+        return News(ticks, [e for e in events if isinstance(e, dict)], ended)
+
+    def _topics(self, content: bytes) -> list[tuple[int, Topic]]:
+        rows = chunk_messages(content)
+        topics = []
+        for number, channel in self._channels.items():
+            mine = rows.channel == number
+            if not mine.any() or channel.topic not in (schema.TICK, schema.EVENT, schema.SENTINEL):
+                continue
+            at = rows.offset[mine] + RECORD.size + MESSAGE.size
+            part = Part(content, at, rows.size[mine], rows.time[mine], rows.sequence[mine])
+            dtype = self.header.dtype if channel.topic == schema.TICK else None
+            topics.append((number, Topic(channel.topic, channel, "", dtype, lambda work, part=part: [work(part)])))  # type: ignore[misc]
+        return topics
+
+
+def newest(folder: Path) -> Path:
+    """Return the log of a folder that is being written, else the newest. Raises LogError when there is none."""
+    files = [*folder.glob("*.mcap" + OPEN)] or [*folder.glob("*.mcap")]
+    if not files:
+        raise LogError(f"{folder}: no log in it")
+    return max(files, key=lambda p: p.stat().st_mtime)

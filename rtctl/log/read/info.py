@@ -1,0 +1,66 @@
+"""What a log is, at a glance: from its end when it is whole, by reading it when it is not."""
+
+from pathlib import Path
+from typing import Any
+
+from rtctl.errors import LogError
+from rtctl.log import schema
+from rtctl.log.mcap.summary import WRAP
+from rtctl.log.read.reader import Log, read
+
+
+def info(path: Path | str) -> dict[str, Any]:
+    """Return duration; per topic n, Hz and sequence holes; dropouts, exit cause, versions, config hash.
+
+    Raises LogError when the file cannot be read or is not an MCAP file.
+    """
+    log = read(path)
+    start, stop = log.span
+    duration = (stop - start) / 1e9
+    counts = log.counts
+    dropouts = log[schema.DROPOUT].json if schema.DROPOUT in counts else []
+    return {
+        "path": str(path),
+        "bytes": log.size,
+        "complete": log.complete,
+        "torn_bytes": 0 if log.complete else log.size - log.good,
+        "start_ns": start,
+        "end_ns": stop,
+        "duration_s": duration,
+        "topics": {
+            name: {
+                "messages": n,
+                "hz": (n - 1) / duration if duration > 0.0 and n > 1 else 0.0,
+                "holes": (last - first + 1 - n) % WRAP if first or last else 0,
+                "schema": log.schema_of(name),
+            }
+            for name, (n, first, last) in sorted(counts.items())
+        },
+        "dropouts": {"messages": len(dropouts), "entries": sum(_count(d) for d in dropouts)},
+        "damaged_chunks": log.damaged,
+        "sentinel": log.sentinel,
+        **_origin(log),
+    }
+
+
+def _count(dropout: dict[str, Any]) -> int:
+    count = dropout.get("count", 0)
+    return count if isinstance(count, int) else 0
+
+
+def _origin(log: Log) -> dict[str, Any]:
+    """Return what the header says; {} for the logs of other programs."""
+    try:
+        header = log.header
+    except LogError:
+        return {}
+    return {
+        "robot": header.robot,
+        "joints": list(header.joints),
+        "period_s": header.period,
+        "versions": dict(header.versions),
+        "revision": header.revision,
+        "config_sha256": header.config_sha256,
+        "extra": dict(header.extra),
+        "attachments": {name: len(data) for name, data in log.attachments.items()},
+    }

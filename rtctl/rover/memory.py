@@ -1,0 +1,59 @@
+"""What one tick of the base leaves to the next, as one value."""
+
+from typing import NamedTuple
+
+from rtctl.rover.estimator import Estimate
+from rtctl.rover.faults import Counters
+from rtctl.rover.occupancy import Chart
+from rtctl.rover.path import Way
+from rtctl.rover.signals import BaseFeedback
+from rtctl.types import F64, I64, Goal, Severity, State, Status
+from rtctl.world.obstacle_table import World
+
+
+class BaseMemory(NamedTuple):
+    """Everything a tick knows of the past."""
+
+    tick: int
+    # supervisor
+    state: State
+    since: int  # tick of entering the state
+    reaction: Severity
+    off: bool  # SAFE_STOP does not stream any more
+    held: bool  # SAFE_STOP asked for the autopilot's hold mode
+    in_force: int
+    good: I64  # (faults,)
+    counters: Counters
+    entered: bool  # our mode was seen since ARMED
+    mine: bool  # we armed the vehicle and nobody took it since
+    leaving: bool
+    done: bool
+    verdict: str
+    # estimate
+    here: Estimate
+    innovation: float  # [m] of the last report
+    unheard: float  # [s] since the last position
+    jump: bool
+    rest: int  # ticks at rest
+    last: BaseFeedback  # of the previous tick
+    # task
+    goal: Goal | None
+    goal_rho: F64  # (K,)
+    status: Status
+    blocker: int
+    nearest: float  # [m] least length of way to the goal so far
+    still: int  # ticks since that became less
+    # world
+    world: World
+    chart: Chart
+    free: F64  # (SIZE, SIZE) [m] as of the last look for a way
+    scan: F64  # (m, 2) [m] returns of the last scan, in the world
+    way: Way
+    due: int  # tick at which the way is looked for anew
+    rho: F64  # (K,) [m] to each told obstacle
+    rho_seen: float  # [m] to the nearest return
+    # command
+    v_ref: F64  # (2,) [m/s]
+    v: float  # [m/s] last sent
+    w: float  # [rad/s]
+    sent: F64  # (h, 2) the last twists [m/s, rad/s], newest first: what is still on its way to the wheels

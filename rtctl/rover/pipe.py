@@ -1,0 +1,270 @@
+"""One tick of the base: feedback and requests in, a twist and a record out. Pure, as the arm's.
+
+The block diagram is the arm's with a planar model: estimate, supervise, field, law, limits, command.
+"""
+
+import math
+
+import numpy as np
+
+from rtctl.kernel import reductions as scans
+from rtctl.rover import estimator, law, occupancy, path
+from rtctl.rover.faults import FAULTS, Counters, severity
+from rtctl.rover.memory import BaseMemory
+from rtctl.rover.record import make_base_record
+from rtctl.rover.robot import SECTORS, Base, Wheels
+from rtctl.rover.session import detected, driving, goal_distance, supervised, with_goal
+from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word, at_rest
+from rtctl.types import F64, Goal, ObstacleEdit, Record, Request, Severity, Shape, State, Status, Task
+from rtctl.world import obstacle_table
+
+MISSED_MAX = 50  # slots that the estimate coasts through; more is a fault
+NEAR = 6.0  # [m] that returns are looked at around the base
+PROGRESS = 0.3  # [m] by which the way must become shorter to count
+Judged = tuple[F64, law.Push, F64, float]  # v_ref wanted, field, xd_d, allowed speed
+
+
+def tick(
+    base: Base, memory: BaseMemory, feedback: BaseFeedback, request: Request
+) -> tuple[BaseMemory, BaseCommand, Record]:
+    """Return (memory, command, record) of one servo period."""
+    m = memory._replace(tick=memory.tick + 1, verdict="")
+    elapsed = base.dt * (1 + min(feedback.missed, MISSED_MAX))
+    m = _estimated(base, m, feedback, elapsed)
+    m = _perceived(base, m, feedback, request, elapsed)
+    m, present = detected(base, m, feedback)
+    m = supervised(base, m, feedback, request, present)
+    m = with_goal(base, m, request)
+    m = _guided(base, m)
+    m, judged = _law(base, m, feedback, elapsed)
+    m, command = _commanded(base, m, feedback, judged, elapsed)
+    m = _diagnosed(base, m)
+    m = m._replace(last=feedback)
+    return m, command, _record(base, m, feedback, request, judged, command)
+
+
+def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
+    """Return the memory before the first tick: IDLE, at rest where the feedback says the base is."""
+    table = obstacle_table.with_static(obstacle_table.empty(base.slots, base.meshes), base.obstacles)
+    seen = occupancy.empty(feedback.position)
+    far = np.full(base.slots, np.inf)
+    return BaseMemory(
+        tick=-1, state=State.IDLE, since=-1, reaction=Severity.NONE, off=False, held=False, in_force=0,
+        good=np.full(len(FAULTS), 1 << 30), counters=Counters(), entered=False, mine=False, leaving=False, done=False,
+        verdict="", here=estimator.start(feedback.position, feedback.yaw, base.noise), innovation=0.0, unheard=0.0,
+        jump=False, rest=0, last=feedback, goal=None, goal_rho=far, status=Status.NO_GOAL, blocker=-1, nearest=np.inf,
+        still=0, world=table, chart=seen, free=occupancy.free_distance(seen, table.obstacles, base.margins.height),
+        scan=np.zeros((0, 2)), way=path.NO_WAY, due=0, rho=far, rho_seen=np.inf, v_ref=np.zeros(2), v=0.0, w=0.0,
+        sent=np.zeros((law.history(base), 2)),
+    )  # fmt: skip
+
+
+def _estimated(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> BaseMemory:
+    """Where the base is at this slot; a report that speed cannot explain is a jump, and the frame moves with it."""
+    here = estimator.predicted(m.here, elapsed, base.noise)
+    here = here._replace(yaw=estimator.wrapped(f.yaw + f.attitude_age * f.yaw_rate), yaw_rate=f.yaw_rate)
+    unheard, innovation, jump = m.unheard + elapsed, m.innovation, False
+    seen, points = m.chart, m.scan
+    if f.fresh:
+        before = here
+        here, innovation = estimator.measured(here, f.position, f.velocity, f.position_age, base.noise)
+        jump = innovation > base.safety.jump + base.limits.v_max * unheard
+        jump = jump or (f.reset != m.last.reset and innovation > base.safety.jump)
+        if jump:
+            here = estimator.start(f.position + f.position_age * f.velocity, here.yaw, base.noise)
+            here = here._replace(v=f.velocity.copy(), yaw_rate=f.yaw_rate)
+            seen, points = occupancy.shifted(seen, here.x - before.x), points + (here.x - before.x)
+        unheard = 0.0
+    still = math.hypot(*here.v) < 0.1 and abs(here.yaw_rate) < 0.1
+    return m._replace(
+        here=here, unheard=unheard, innovation=innovation, jump=jump, chart=seen, scan=points,
+        rest=m.rest + 1 if still else 0,
+    )  # fmt: skip
+
+
+def _perceived(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, elapsed: float) -> BaseMemory:
+    """Told obstacles moved on and edited, a new scan drawn into the chart from where it was taken."""
+    table, verdict = obstacle_table.advanced(m.world, elapsed), m.verdict
+    if request.obstacles:
+        table, verdict = obstacle_table.edited(table, request.obstacles)
+    seen, points, due = occupancy.moved(m.chart, m.here.x), m.scan, m.due
+    if f.scans and f.scan_age < base.safety.scan_stale:
+        x, yaw = m.here.x - f.scan_age * m.here.v, m.here.yaw - f.scan_age * m.here.yaw_rate
+        reach = min(f.scan_reach, base.sense)
+        seen = occupancy.looked(seen, x, yaw, f.scan, f.scan_start, f.scan_step, reach)
+        points, due = _returns(x, yaw, f, reach), min(due, m.tick)
+    rho = m.goal_rho if m.goal is None else goal_distance(base, table, m.goal)
+    return m._replace(world=table, verdict=verdict, chart=seen, scan=points, due=due, goal_rho=rho)
+
+
+def _returns(x: F64, yaw: float, f: BaseFeedback, reach: float) -> F64:
+    """Return the points (m, 2) [m] that a scan taken at x (2,), yaw touched."""
+    hit = (f.scan >= 0.0) & (f.scan <= reach)
+    angle = yaw + f.scan_start + f.scan_step * np.flatnonzero(hit)
+    points: F64 = x + f.scan[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return points
+
+
+def _surroundings(m: BaseMemory, f: BaseFeedback) -> tuple[F64, int]:
+    """Return every return (m, 2) [m] near the base, and how many are of the newest scan and single sensors: first."""
+    x, yaw = m.here.x, m.here.yaw
+    parts = [m.scan]
+    hit = f.beams >= 0.0
+    if hit.any():
+        angle = yaw - 0.25 * np.pi * np.flatnonzero(hit)
+        parts.append(x + f.beams[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    now = sum(map(len, parts))
+    return np.concatenate([*parts, occupancy.returns_near(m.chart, x, NEAR)]), now
+
+
+def _guided(base: Base, m: BaseMemory) -> BaseMemory:
+    """Keep the way to the goal; look for it anew when a scan came or its time has."""
+    if m.goal is None or m.state != State.RUN:
+        return m
+    x, goal, room = m.here.x, m.goal.position[:2], base.margins.room
+    if m.tick >= m.due:
+        free = occupancy.free_distance(m.chart, m.world.obstacles, base.margins.height)
+        way = path.way_to(free, m.chart.origin, x, goal, room, m.way)
+        m = m._replace(free=free, way=way, due=m.tick + max(1, round(base.plan_dt / base.dt)))
+    else:
+        kept = path.remaining(m.free, m.chart.origin, x, m.way, room)
+        m = m._replace(way=kept, due=m.due if len(kept.corners) else m.tick + 1)
+    whole = m.way.length + m.way.short
+    gained = whole < m.nearest - PROGRESS
+    return m._replace(nearest=whole if gained else m.nearest, still=0 if gained else m.still + 1)
+
+
+def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
+    """Evaluate field and goal at the state that a set-point sent now will meet."""
+    x, yaw = _ahead(base, m)
+    seen, now = _surroundings(m, f)
+    push = law.field(base, m.here.x, m.here.yaw, m.here.v, seen, now, m.world.obstacles)
+    moves = driving(m) and m.state == State.RUN and severity(m.in_force) < Severity.SS2
+    xd_d, total = np.zeros(2), np.zeros(2)
+    if moves:
+        total = push.seen + push.told.sum(axis=0)
+        if m.goal is not None and m.status != Status.ARRIVED and len(m.way.corners):
+            way = path.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
+            way = way if len(way.corners) else m.way  # from where it will be no corner is in sight: head on
+            xd_d = law.desired(base, x, way.corners[0], way.length)
+    v_ref = law.integrated(base, m.v_ref, xd_d, total, elapsed) if driving(m) else np.zeros(2)
+    if m.state == State.RUN and not moves:
+        v_ref = np.zeros(2)  # SS2: zero twist, at once
+    speed = float(np.hypot(*v_ref))
+    direction = v_ref / speed if speed > 1e-6 else np.array([math.cos(yaw), math.sin(yaw)])
+    if base.wheels != Wheels.HOLONOMIC and not base.world_velocity:
+        sign = 1.0 if law.unicycle(base, v_ref, yaw)[0] >= 0.0 else -1.0
+        direction = sign * np.array([math.cos(yaw), math.sin(yaw)])
+    coming = float((x - m.here.x) @ direction)
+    allowed = law.allowed_speed(base, m.here.x, direction, coming, seen, m.world.obstacles, push)
+    m = m._replace(rho=push.rho, rho_seen=push.rho_seen)
+    return m, (v_ref, push, xd_d, allowed)
+
+
+def _ahead(base: Base, m: BaseMemory) -> tuple[F64, float]:
+    """Return the pose that a command sent now will meet."""
+    if base.world_velocity or base.wheels == Wheels.HOLONOMIC:
+        return m.here.x + base.margins.lag * m.here.v, m.here.yaw
+    return law.ahead_of(base, m.here.x, m.here.yaw, m.sent)
+
+
+def _commanded(
+    base: Base, m: BaseMemory, f: BaseFeedback, judged: Judged, elapsed: float
+) -> tuple[BaseMemory, BaseCommand]:
+    """Turn v_ref into what the wheels take, under their limits and the governor's."""
+    v_ref, _, _, allowed = judged
+    ask = _asked(base, m, f)
+    lim = base.limits
+    v, w, velocity = 0.0, 0.0, np.zeros(2)
+    if not (np.isfinite(v_ref).all() and math.isfinite(allowed)):
+        v_ref = np.zeros(2)  # seen by `detected` in the next tick through what was sent
+    elif ask == Ask.DRIVE:
+        speed = float(np.hypot(*v_ref))
+        velocity = v_ref * min(1.0, allowed / speed) if speed > 1e-6 else np.zeros(2)
+        v, w = law.unicycle(base, v_ref, _ahead(base, m)[1])
+        v = math.copysign(min(abs(v), allowed), v)
+        if m.state == State.RUN:
+            v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
+            w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
+    if m.state != State.RUN and ask == Ask.DRIVE and m.state != State.STOPPING:
+        v, w, velocity = 0.0, 0.0, np.zeros(2)
+    sent = np.concatenate([[[v, w]], m.sent[:-1]])
+    return m._replace(v_ref=v_ref, v=v, w=w, sent=sent), BaseCommand(ask, v, w, velocity)
+
+
+def _asked(base: Base, m: BaseMemory, f: BaseFeedback) -> Ask:
+    """Return what the state asks of the autopilot; nothing is streamed into a mode that is not ours."""
+    if m.state == State.ARMED:
+        return Ask.ENGAGE
+    if m.state in (State.IDLE, State.FAULT):
+        resting = m.state == State.IDLE or m.rest * base.dt > 0.5
+        return Ask.DISARM if m.mine and f.armed and resting else Ask.SILENCE
+    if not f.ours or (m.state == State.SAFE_STOP and m.off):
+        return Ask.SILENCE
+    if m.state == State.SAFE_STOP and m.held:
+        return Ask.HOLD
+    return Ask.DRIVE
+
+
+def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
+    """Level of competence: what the base is doing about its goal."""
+    if m.goal is None or m.state != State.RUN:
+        return m._replace(status=Status.NO_GOAL, blocker=-1)
+    error = float(np.hypot(*(m.goal.position[:2] - m.here.x)))
+    bound = m.goal.tolerance * (2.0 if m.status == Status.ARRIVED else 1.0)
+    if error <= bound and (m.status == Status.ARRIVED or math.hypot(*m.here.v) < 0.3):
+        return m._replace(status=Status.ARRIVED, blocker=-1, still=0)
+    if m.still * base.dt < base.stall:
+        return m._replace(status=Status.MOVING, blocker=-1)
+    nearest = int(m.goal_rho.argmin())
+    if m.goal_rho[nearest] < base.margins.room:
+        return m._replace(status=Status.SHADOWED, blocker=nearest)
+    if 0.0 < m.way.short < base.margins.room + 2.0 * occupancy.CELL:
+        return m._replace(status=Status.SHADOWED, blocker=-1)
+    holding = int(m.rho.argmin())
+    return m._replace(status=Status.LOCAL_MINIMUM, blocker=holding if m.rho[holding] < base.field.rho0 else -1)
+
+
+def _record(
+    base: Base, m: BaseMemory, f: BaseFeedback, request: Request, judged: Judged, command: BaseCommand
+) -> Record:
+    """Write everything that came in and went out into one struct."""
+    v_ref, push, xd_d, allowed = judged
+    goal = m.goal.position if m.goal is not None else np.array([*m.here.x, 0.0])
+    corners = np.zeros((path.CORNERS, 2))
+    corners[: len(m.way.corners)] = m.way.corners
+    return make_base_record(
+        base.slots,
+        tick=m.tick, slot=max(f.slot, 0), time=f.slot * base.dt, missed=f.missed, link=f.link, position=f.position,
+        velocity=f.velocity, yaw=f.yaw, yaw_rate=f.yaw_rate, position_age=f.position_age, attitude_age=f.attitude_age,
+        fresh=f.fresh, reset=f.reset, scan=f.scan, scan_start=f.scan_start, scan_step=f.scan_step,
+        scan_reach=f.scan_reach, scan_age=f.scan_age, scans=f.scans, beams=f.beams, heartbeat_age=f.heartbeat_age,
+        ours=f.ours, mode=f.mode, armed=f.armed, reboots=f.reboots, healthy=f.healthy, word=f.word, lost=f.lost,
+        refused=f.refused, verb=request.verb, lateness=f.lateness, compute=f.compute,
+        x=[*m.here.x, 0.0], xd=[*m.here.v, 0.0], heading=m.here.yaw, innovation=m.innovation, goal=goal,
+        error=float(np.hypot(*(goal[:2] - m.here.x))), way=corners, corners=len(m.way.corners),
+        way_length=m.way.length, way_short=m.way.short, rho=push.rho, push_told=push.told, rho_seen=push.rho_seen,
+        push_seen=push.seen, xd_d=xd_d, v_ref=v_ref, allowed=allowed, v=command.v, w=command.w,
+        v_world=command.velocity, command=command.ask, state=m.state, status=m.status, blocker=m.blocker,
+        severity=m.reaction, faults=m.in_force,
+    )  # fmt: skip
+
+
+def warm(base: Base) -> None:
+    """Run the tick through every kind of work once, so that nothing is compiled or loaded while the base moves."""
+    f = at_rest(np.zeros(2), 0.0)
+    distances = np.full(SECTORS, np.inf)
+    distances[:9] = 3.0
+    f = f._replace(
+        slot=0, fresh=1, scan=distances, scan_reach=10.0, scan_age=0.05, scans=1, ours=True, armed=True,
+        beams=np.full(8, 2.0), word=int(Word.ACCEPTED),
+    )  # fmt: skip
+    far, upright = np.array([0.0, 0.0, 50.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    shape = Shape("warm", "sphere", np.array([0.1, 0.1, 0.1, 2.0]), far, upright, np.ones(3), np.zeros(3))
+    m = initial(base, f)._replace(state=State.RUN, entered=True, mine=True, v_ref=np.ones(2))
+    goal = Goal(np.array([12.0, 1.0, 0.0]), upright, Task.POSITION, base.tolerance, 0.1)
+    for _ in range(3):
+        m, _, _ = tick(base, m, f, Request(goal=goal, obstacles=(ObstacleEdit("warm", shape),)))
+        f = f._replace(slot=f.slot + 1)
+    tick(base, m._replace(state=State.SAFE_STOP, reaction=Severity.SS1), f, Request())
+    scans.any_below(m.rho, 0.0)

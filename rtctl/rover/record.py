@@ -1,0 +1,55 @@
+"""One tick of the base as one struct: everything that came in and went out."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from rtctl.rover.path import CORNERS
+from rtctl.rover.robot import SECTORS
+from rtctl.rover.signals import BaseFeedback
+from rtctl.types import Record
+
+
+@cache
+def base_dtype(slots: int) -> "np.dtype[Any]":
+    """Return the dtype of a record; names shared with the arm's record mean the same."""
+    f, i, u = "<f8", "<i4", "<u4"
+    return np.dtype(
+        [
+            ("tick", u), ("slot", "<u8"), ("time", f), ("missed", u), ("link", u),
+            # what came in
+            ("position", f, (2,)), ("velocity", f, (2,)), ("yaw", f), ("yaw_rate", f), ("position_age", f),
+            ("attitude_age", f), ("fresh", i), ("reset", i), ("scan", f, (SECTORS,)), ("scan_start", f),
+            ("scan_step", f), ("scan_reach", f), ("scan_age", f), ("scans", i), ("beams", f, (8,)),
+            ("heartbeat_age", f), ("ours", u), ("mode", u), ("armed", u), ("reboots", u), ("healthy", u), ("word", i),
+            ("lost", u), ("refused", u), ("verb", u), ("lateness", f), ("compute", f),
+            # estimate and task
+            ("x", f, (3,)), ("xd", f, (3,)), ("heading", f), ("innovation", f), ("goal", f, (3,)), ("error", f),
+            ("way", f, (CORNERS, 2)), ("corners", i), ("way_length", f), ("way_short", f),
+            # obstacles
+            ("rho", f, (slots,)), ("push_told", f, (slots, 2)), ("rho_seen", f), ("push_seen", f, (2,)),
+            # command
+            ("xd_d", f, (2,)), ("v_ref", f, (2,)), ("allowed", f), ("v", f), ("w", f), ("v_world", f, (2,)),
+            ("command", u), ("state", u), ("status", u), ("blocker", i), ("severity", u), ("faults", "<u8"),
+        ]
+    )  # fmt: skip
+
+
+def make_base_record(slots: int, **values: Any) -> Record:
+    """Return the record of one tick, read-only."""
+    record = np.zeros((), base_dtype(slots))
+    for name, value in values.items():
+        record[name] = value
+    record.flags.writeable = False
+    return record
+
+
+def feedback_from(row: Any) -> BaseFeedback:
+    """Return the feedback that a record was made from: with the requests of the log all that a replay needs."""
+    kinds = {int: int, bool: bool, float: float}
+    values: dict[str, Any] = {}
+    for name, kind in BaseFeedback.__annotations__.items():
+        value = row[name]
+        values[name] = np.array(value) if value.shape else kinds[kind](value)
+    return BaseFeedback(**values)

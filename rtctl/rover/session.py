@@ -1,0 +1,175 @@
+"""The supervisor's work of one tick of the base: the arm's table of states, with an autopilot in place of drives."""
+
+import math
+
+import numpy as np
+
+from rtctl.control import goals, supervisor
+from rtctl.control.supervisor import EVENT_FOR, EVENT_OF, Event
+from rtctl.kernel import reductions
+from rtctl.rover import faults, path
+from rtctl.rover.faults import BIT, Evidence
+from rtctl.rover.memory import BaseMemory
+from rtctl.rover.robot import Base
+from rtctl.rover.signals import BaseFeedback, Word
+from rtctl.types import F64, Goal, Request, Severity, State, Status, Task, Verb
+from rtctl.world import obstacle_table
+from rtctl.world.obstacle_table import World
+
+SETTLE = 0.2  # [s] in our mode and armed before RUN
+REST_HOLD = 0.5  # [s] at rest before set-points end
+STOP_TIME = 6.0  # [s] after which a stop is believed over: no feedback says so
+HOLD_TIME = 3.0  # [s] for the autopilot to take its hold mode
+DISARM_TIME = 3.0  # [s] for it to disarm
+REFUSALS = (Word.DENIED, Word.UNSUPPORTED, Word.FAILED, Word.NO_ANSWER)
+
+
+def driving(m: BaseMemory) -> bool:
+    """Return whether the state streams set-points."""
+    if m.state == State.SAFE_STOP:
+        return not m.off
+    return m.state in (State.RUN, State.STOPPING)
+
+
+def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, int]:
+    """Return the memory with the faults in force, and the bits of those present now."""
+    active = driving(m)
+    watched = active and not m.held
+    taken = watched and m.entered and not f.ours
+    taken = taken or (m.state == State.ARMED and m.entered and not f.ours)
+    failed = m.state == State.ARMED and (f.word in REFUSALS or (m.tick - m.since) * base.dt >= base.engage)
+    evidence = Evidence(
+        active=active,
+        engaged=watched and m.mine,
+        taken=taken,
+        engage_failed=failed,
+        jump=m.jump and active,
+        not_finite=not (math.isfinite(m.v) and math.isfinite(m.w) and math.isfinite(m.innovation)),
+        contact=reductions.any_below(m.rho, 0.0) or m.rho_seen < 0.0,
+        goal_inside=m.goal is not None and reductions.any_below(m.goal_rho, 0.0),
+        feed_age=obstacle_table.oldest(m.world),
+        reboots=m.last.reboots,
+    )
+    present, counters = faults.detect(f, evidence, m.counters, base.safety)
+    # before it is ours to command, what is wrong with the vehicle is news, not a stop that somebody must reset
+    kept = m.in_force if m.state != State.IDLE else m.in_force & (faults.automatic() | _lasting())
+    in_force, good = faults.latch(present, kept, m.good)
+    return m._replace(counters=counters, in_force=in_force, good=good), present
+
+
+def _lasting() -> int:
+    return sum(BIT[fault.name] for fault in faults.FAULTS if fault.clear == "L")
+
+
+def supervised(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, present: int) -> BaseMemory:
+    """Return the memory after the supervisor's table took this tick's events."""
+    m, events = _asked(m, request, present)
+    worst = faults.stops(m.in_force)
+    if worst >= Severity.SS2:
+        events.add(EVENT_FOR[worst])
+    events |= _timed(base, m, f, present)
+    state, event = supervisor.next_state(m.state, events)
+    if state in (State.SAFE_STOP, State.FAULT):
+        m = m._replace(reaction=max(m.reaction, worst, Severity.SS2 if event == Event.STOP else Severity.NONE))
+    if state != m.state:
+        m = _entered(m, state)
+    return _followed(base, m, f, present)
+
+
+def _followed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> BaseMemory:
+    """Return the memory after what the vehicle did: whose it is, and how far a stop has come."""
+    taken = present & (BIT["mode_taken"] | BIT["disarmed"] | BIT["rebooted"])
+    if m.state in (State.ARMED, State.RUN) and f.ours:
+        m = m._replace(entered=True, mine=m.mine or f.armed)
+    if taken or (m.mine and not f.armed):
+        m = m._replace(mine=False, entered=False)
+    if m.state == State.SAFE_STOP and not m.off:
+        elapsed = (m.tick - m.since) * base.dt
+        over = m.rest * base.dt >= REST_HOLD or elapsed >= STOP_TIME
+        held = m.held or (m.reaction >= Severity.SS1 and over)
+        gone = bool(m.in_force & (BIT["mode_taken"] | BIT["disarmed"])) or (held and not f.ours)
+        m = m._replace(held=held, off=gone or (held and elapsed >= STOP_TIME + HOLD_TIME))
+    waiting = m.mine and f.armed and (m.tick - m.since) * base.dt < DISARM_TIME
+    at_rest = m.state in (State.IDLE, State.FAULT) or (m.state == State.SAFE_STOP and m.off)
+    return m._replace(done=m.leaving and at_rest and not waiting)
+
+
+def _asked(m: BaseMemory, request: Request, present: int) -> tuple[BaseMemory, set[Event]]:
+    """Return the event of the operator's verb, or the memory with the reason why there is none."""
+    verb = request.verb
+    if verb == Verb.NONE:
+        return m, set()
+    if verb == Verb.TERM:  # the second one does not wait for rest
+        return m._replace(leaving=True), {Event.STO if m.leaving else Event.TERM}
+    verdict = ""
+    if verb == Verb.RECOVER or (m.state, EVENT_OF[verb]) not in supervisor.TABLE:
+        verdict = "a base has no joint limits" if verb == Verb.RECOVER else f"not possible in state {m.state.name}"
+    elif verb == Verb.ARM:
+        verdict = _held_by((m.in_force | present) & faults.REFUSES_ARMING)
+    elif verb == Verb.RESET:
+        m = m._replace(in_force=faults.cleared(m.in_force, present))
+        verdict = _held_by(m.in_force & ~faults.automatic())
+    if verdict:
+        return m._replace(verdict=f"{verb.name.lower()}: {verdict}"), set()
+    return m, {EVENT_OF[verb]}
+
+
+def _held_by(bits: int) -> str:
+    return "; ".join(f"{name} ({faults.FAULTS[faults.INDEX[name]].text})" for name in faults.names(bits))
+
+
+def _timed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> set[Event]:
+    """Return the events that come of waiting."""
+    elapsed = (m.tick - m.since) * base.dt
+    if m.state == State.ARMED:
+        if f.ours and f.armed and elapsed >= SETTLE:
+            return {Event.SETTLED}
+        return {Event.TIMEOUT} if present & BIT["engage_refused"] else set()
+    if m.state == State.STOPPING:
+        rested = m.rest * base.dt >= REST_HOLD and elapsed >= REST_HOLD
+        return {Event.RESTED} if rested or not f.ours or elapsed >= STOP_TIME else set()
+    return set()
+
+
+def _entered(m: BaseMemory, state: State) -> BaseMemory:
+    """Return the memory on entering a state: every motion begins from rest or from what is."""
+    m = m._replace(
+        state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False, held=False,
+        way=path.NO_WAY, nearest=np.inf,
+    )  # fmt: skip
+    if state == State.ARMED:
+        m = m._replace(v_ref=np.zeros(2), v=0.0, w=0.0, entered=False, mine=False)
+    if state not in (State.SAFE_STOP, State.FAULT):
+        m = m._replace(reaction=Severity.NONE)
+    return m
+
+
+def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
+    """Return the memory with the request's goal, or with the reason why it was refused."""
+    goal = request.goal
+    if goal is None:
+        return m
+    rho = m.goal_rho
+    verdict = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
+    if not verdict and goal.task not in (Task.POSITION, Task.X | Task.Y):
+        verdict = "goal: a base takes a position alone, wanted x and y and no orientation"
+    if not verdict:
+        rho = goal_distance(base, m.world, goal)
+        verdict = goals.refusal(goal, np.zeros(3), base.reach, rho, m.world.names)
+    if verdict:
+        return m._replace(verdict=verdict.replace("from the base", "from the origin").replace("arm's ", ""))
+    return m._replace(
+        goal=goal,
+        goal_rho=rho,
+        status=Status.MOVING,
+        blocker=-1,
+        still=0,
+        way=path.NO_WAY,
+        nearest=np.inf,
+        due=m.tick,
+    )
+
+
+def goal_distance(base: Base, table: World, goal: Goal) -> F64:
+    """Return the distance (K,) [m] of a goal to each told obstacle, at the height these are cut at."""
+    return obstacle_table.distance_from(table, np.array([goal.position[0], goal.position[1], base.margins.height]))

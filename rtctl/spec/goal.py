@@ -1,0 +1,102 @@
+"""What a goal asks for, as scenario files and the control socket say it, and the goal that the tick takes."""
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal, Protocol
+
+import numpy as np
+from msgspec import Meta
+
+from rtctl.arm.task import between
+from rtctl.kernel.rotations import exp3, quat_of
+from rtctl.spec.obstacles import Orientation, Place, RollPitchYaw, Unit, orientation_contradiction, quaternion
+from rtctl.types import F64, Goal, Task
+
+LinearAxis = Literal["x", "y", "z"]
+Axes = Annotated[tuple[LinearAxis, ...], Meta(min_length=1, max_length=3, description="position along these alone")]
+Direction = Annotated[tuple[Unit, Unit, Unit], Meta(description="of the tool's axis in the world; roll is free")]
+ToolAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], Meta(description="of the tip's frame, for a direction")]
+_BITS = {"x": Task.X, "y": Task.Y, "z": Task.Z, "rx": Task.RX, "ry": Task.RY, "rz": Task.RZ}
+
+
+class Asked(Protocol):
+    """The fields that say where the tip is to go."""
+
+    @property
+    def position_m(self) -> Place | None: ...
+    @property
+    def axes(self) -> tuple[LinearAxis, ...] | None: ...
+    @property
+    def wxyz(self) -> Orientation | None: ...
+    @property
+    def rpy_rad(self) -> RollPitchYaw | None: ...
+    @property
+    def hold(self) -> Literal["orientation"] | None: ...
+    @property
+    def direction(self) -> tuple[float, float, float] | None: ...
+    @property
+    def tool_axis(self) -> str | None: ...
+    @property
+    def tolerance_m(self) -> float | None: ...
+    @property
+    def tolerance_rad(self) -> float | None: ...
+
+
+def task_of(axes: Sequence[str]) -> Task:
+    """Return the task of axes by name."""
+    bits = 0
+    for axis in axes:
+        bits |= int(_BITS[axis])
+    return Task(bits)
+
+
+def goal_contradiction(goal: Asked) -> tuple[str, object, str] | None:
+    """Return the first contradiction within a goal as (key, got, wanted), None when there is none."""
+    if found := orientation_contradiction(goal.rpy_rad, goal.wxyz):
+        return found
+    oriented = goal.rpy_rad is not None or goal.wxyz is not None
+    if goal.hold and oriented:
+        return "hold", goal.hold, "nothing beside wxyz or rpy_rad"
+    if goal.direction is not None:
+        if oriented or goal.hold:
+            return "direction", list(goal.direction), "no orientation beside it"
+        if np.linalg.norm(goal.direction) < 1e-3:
+            return "direction", list(goal.direction), "a vector that points somewhere"
+    elif goal.tool_axis is not None:
+        return "tool_axis", goal.tool_axis, "a direction beside it"
+    if goal.position_m is None:
+        if goal.axes is not None:
+            return "axes", ", ".join(goal.axes), "a position_m beside it"
+        if not (oriented or goal.hold or goal.direction):
+            return "position_m", "nothing", "a position, an orientation or a direction"
+    if goal.axes is not None and len(set(goal.axes)) != len(goal.axes):
+        return "axes", ", ".join(goal.axes), "each axis once"
+    return None
+
+
+def goal_from(goal: Asked, wxyz: Callable[[], F64], tolerance: float, tolerance_rot: float) -> Goal:
+    """Return the goal as the tick takes it.
+
+    wxyz: the tip's orientation now (4,), for a goal that holds it. tolerance [m], tolerance_rot [rad]: the robot's, for
+    a goal that gives none.
+    """
+    bits = 0 if goal.position_m is None else int(task_of(goal.axes or ("x", "y", "z")))
+    axis = np.zeros(3)
+    axis["xyz".index((goal.tool_axis or "z")[-1])] = -1.0 if (goal.tool_axis or "z")[0] == "-" else 1.0
+    if goal.direction is not None:
+        bits |= int(Task.DIRECTION)
+        towards = np.array(goal.direction, dtype=np.float64)
+        turn = quat_of(exp3(between(axis, towards / np.linalg.norm(towards))))
+    elif goal.rpy_rad is not None or goal.wxyz is not None:
+        bits |= int(Task.ORIENTATION)
+        turn = quaternion(goal.rpy_rad, goal.wxyz)
+    else:
+        bits |= int(Task.ORIENTATION) if goal.hold else 0
+        turn = np.array(wxyz(), dtype=np.float64) if goal.hold else np.array([1.0, 0.0, 0.0, 0.0])
+    return Goal(
+        position=np.zeros(3) if goal.position_m is None else np.array(goal.position_m, dtype=np.float64),
+        wxyz=turn,
+        task=Task(bits),
+        tolerance=tolerance if goal.tolerance_m is None else goal.tolerance_m,
+        tolerance_rot=tolerance_rot if goal.tolerance_rad is None else goal.tolerance_rad,
+        axis=axis,
+    )
