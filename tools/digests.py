@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from rtctl.app.sim import simulate
-
 from tools.golden import GOLDEN, cpu
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -4,9 +4,9 @@ Crossing into compiled code costs as much as such a question: twenty questions, 
 """
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm.encoders import watched
+from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 
 # what is seen, at some joint or of some obstacle
@@ -27,7 +27,7 @@ from rtctl.types import B1, F64, I64
 ) = (1 << i for i in range(13))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def notice(
     noted: F64, active: bool, q: F64, qd: F64, tau: F64, age: F64, replies: I64, drive: I64,
     sent: F64, q_previous: F64, age_previous: F64, qdd: F64, A: F64, rho: F64, goal_rho: F64, seen_ago: F64, moving: B1,

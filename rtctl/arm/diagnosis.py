@@ -8,13 +8,13 @@ and the shares add up to one: who balances the drive, and by how much.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm.field import Field, own_field
 from rtctl.arm.law import Law
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.task import error_of, selected, task_error
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec, symmetric_eigen, tmatvec
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, I64, Status
@@ -93,7 +93,7 @@ def _drive(robot: Robot, m: Memory, law: Law) -> F64:
     return robot.motion.k_v * np.concatenate((v, w))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _shares(
     F: F64, J: F64, A_inv: F64, Lambda: F64, Jp: F64, link: I64, field: Field, tau_own: F64,
     tau_obstacles: F64, tau_limits: F64, q: F64, q_min: F64, q_max: F64, zone: F64,
@@ -131,7 +131,7 @@ def _shares(
     return obstacles, limits, own, given / wanted
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def at_edge(J: F64, e: F64) -> bool:
     """Return whether no small motion of any joints takes the tip further along e (3,).
 

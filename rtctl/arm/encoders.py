@@ -6,8 +6,8 @@ joints move: an arm that stands as a whole is held. What it pushes against is fo
 """
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 
 STUCK_TIME = 0.02  # [s] that a position must have been the same to the bit
@@ -31,7 +31,7 @@ def fresh(n: int) -> F64:
     return np.zeros((5, n))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def watched(
     before: F64, q: F64, qd: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qdd: F64, A: F64,
     friction: F64, bound: F64, elapsed: float, dt: float,

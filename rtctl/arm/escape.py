@@ -11,11 +11,11 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.task import selected
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, Goal
@@ -147,7 +147,7 @@ def _asked(t: F64, goal: Goal) -> tuple[F64, bool]:
     return (part / size, True) if size > LEAST else (part, False)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def detour(x: F64, t: F64, goal: F64, obstacles: Obstacles, base: F64, reach: float, rho0: float) -> float:
     """Return the length [m] of the shortest free detour x -> x + r t -> goal over the RADII; long where none is free.
 
@@ -174,7 +174,7 @@ def detour(x: F64, t: F64, goal: F64, obstacles: Obstacles, base: F64, reach: fl
     return 10.0 * reach - run
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _clear(x: F64, obstacles: Obstacles, out: F64) -> float:
     distances_into(x.copy().reshape(3, 1), np.zeros(1), obstacles, np.inf, out)
     least = np.inf
@@ -183,7 +183,7 @@ def _clear(x: F64, obstacles: Obstacles, out: F64) -> float:
     return float(least)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _tangent(n: F64, k: int) -> F64:
     """Return the k-th of DIRECTIONS unit vectors across n (3,), evenly around it; the first is the most upward."""
     up = np.array([0.0, 0.0, 1.0])
@@ -199,6 +199,6 @@ def _tangent(n: F64, k: int) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _dot(a: F64, b: F64) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

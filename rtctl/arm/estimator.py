@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec
 from rtctl.kernel.rotations import compose, error, exp3, orthonormal
 from rtctl.types import B1, F64, I64
@@ -140,7 +140,7 @@ def joint_step(
     return JointEstimate(*fields), innovation
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _propagate(P: F64, dt: float, sigma: float) -> F64:
     """Return F P F^T + Q for F = [1 dt; 0 1] and an acceleration of deviation sigma, constant over the step."""
     q = sigma * sigma * dt * dt
@@ -153,7 +153,7 @@ def _propagate(P: F64, dt: float, sigma: float) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _correct(P: F64, h0: float, h1: float, r: float) -> tuple[float, float, float, F64]:
     """Return S, the gains and the covariance after a scalar measurement h0 x + h1 xd of deviation r (Joseph form)."""
     g0 = P[0, 0] * h0 + P[0, 1] * h1
@@ -171,7 +171,7 @@ def _correct(P: F64, h0: float, h1: float, r: float) -> tuple[float, float, floa
     return S, k0, k1, out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _predict(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     a: F64, alpha: F64, dt: float, sigma_a: float, sigma_alpha: float,
@@ -186,7 +186,7 @@ def _predict(
     return x1, xd1, _propagate(P, dt, sigma_a), R1, omega1, _propagate(P_rot, dt, sigma_alpha)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _update_velocity(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     xd_measured: F64, omega_measured: F64, r_v: float, r_omega: float,
@@ -204,7 +204,7 @@ def _update_velocity(
     return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _tip_step(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     J: F64, Jdqd: F64, qdd: F64, J_now: F64, qd: F64, dt: float,
@@ -216,7 +216,7 @@ def _tip_step(
     return _update_velocity(x1, xd1, P1, R1, omega1, P_rot1, twist[:3], twist[3:], r_v, r_omega)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _update_pose(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     x_measured: F64, R_measured: F64, age: float, r_x: float, r_rot: float,
@@ -237,7 +237,7 @@ def _update_pose(
     return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _joint_step(
     q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, replies: I64 | B1, dt: float,
     sigma_qdd: F64, r_q: F64, r_qd: F64, has_qd: bool,

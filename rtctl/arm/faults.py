@@ -7,10 +7,10 @@ The row numbers are those of the published catalogue; README prints its table fr
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm import detection
 from rtctl.control.faults import Fault, latch_with
+from rtctl.kernel import kernel
 from rtctl.kernel.reductions import any_set
 from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
@@ -124,7 +124,7 @@ class Counters(NamedTuple):
     innovation: int = 0
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def jumped(
     q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
 ) -> B1:
@@ -182,7 +182,7 @@ def detect(link: int, e: Evidence, c: Counters, p: SafetyParams, dt: float) -> t
     return bits, n
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def any_jumped(
     q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
 ) -> bool:

@@ -12,8 +12,6 @@ arm's motion would otherwise feed back into the zone and break the energy balanc
 
 import math
 
-from numba import njit
-
 from rtctl.arm.joint_field import joint_limit_field, own_field
 from rtctl.control.firas import (
     CAPPED,
@@ -28,6 +26,7 @@ from rtctl.control.firas import (
     limit_params,
     rho_num_of,
 )
+from rtctl.kernel import ieee_kernel, kernel
 from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into, speed_bound
 
@@ -53,7 +52,7 @@ _P, _V, _B, _F = 0, 3, 6, 12
 _RHO, _N, _A, _PUSH = 0, 1, 4, 5
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _load(Jp: F64, B: F64, qd: F64, points: F64) -> None:
     """Fill the rows of point velocities Jp qd and mobilities; zero the forces."""
     for j in range(points.shape[1]):
@@ -68,7 +67,7 @@ def _load(Jp: F64, B: F64, qd: F64, points: F64) -> None:
 
 
 # error_model: see firas; the divisor here is at least 1/m_max.
-@njit(cache=True, fastmath=False, error_model="numpy")
+@ieee_kernel
 def _repel(points: F64, p: F64, v: F64, w: F64, k: int, params: FieldParams, pairs: F64) -> None:
     """Write a and lambda (a + d) of every point against the obstacle in slot k.
 
@@ -91,7 +90,7 @@ def _repel(points: F64, p: F64, v: F64, w: F64, k: int, params: FieldParams, pai
         pairs[k, _PUSH, j] = (a + d) * (b * heavy if b <= floor else 1.0 / b)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _least(pairs: F64, k: int) -> tuple[float, int]:
     """Return the least distance in slot k and its first point; a NaN wins, so that it is seen."""
     a, b, c, d = math.inf, math.inf, math.inf, math.inf  # four chains: a compare waits for the one before it
@@ -111,7 +110,7 @@ def _least(pairs: F64, k: int) -> tuple[float, int]:
     return least, 0
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _yield_to_nearer(k: int, near: I64, group: I64, pairs: F64) -> int:
     """Zero the points of slot k for which another part of its union is nearer; return the union's first near slot."""
     leader = k
@@ -126,7 +125,7 @@ def _yield_to_nearer(k: int, near: I64, group: I64, pairs: F64) -> int:
     return leader
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _gather(k: int, leader: int, link: I64, rho_num: float, pairs: F64, share: F64) -> int:
     """Add the accelerations of slot k to the shares of its union; return the flags."""
     flags = 0
@@ -140,7 +139,7 @@ def _gather(k: int, leader: int, link: I64, rho_num: float, pairs: F64, share: F
     return flags
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _add_forces(k: int, link: I64, blend: bool, out: Field) -> None:
     """Add the forces of slot k on the points, blended over the points of each link."""
     pairs, points, leader = out.pairs, out.points, out.leader[k]
@@ -159,7 +158,7 @@ def _add_forces(k: int, link: I64, blend: bool, out: Field) -> None:
     out.force[k, 0], out.force[k, 1], out.force[k, 2] = fx, fy, fz
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _add_torques(Jp: F64, points: F64, tau: F64) -> None:
     """Add sum_j Jp_j^T F_j to tau."""
     for j in range(points.shape[1]):
@@ -169,7 +168,7 @@ def _add_torques(Jp: F64, points: F64, tau: F64) -> None:
                 tau[d] += Jp[j, 0, d] * x + Jp[j, 1, d] * y + Jp[j, 2, d] * z
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _near(P: F64, radius: F64, obstacles: Obstacles, params: FieldParams, prefilter: bool, out: Field) -> bool:
     """Measure all distances; mark the slots within the widest influence in `leader` (>= 0); return whether any is."""
     for j in range(radius.shape[0]):
@@ -189,7 +188,7 @@ def _near(P: F64, radius: F64, obstacles: Obstacles, params: FieldParams, prefil
     return any_near
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def field(
     P: F64,
     Jp: F64,

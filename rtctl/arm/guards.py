@@ -12,8 +12,8 @@ is left of a push away from an obstacle may then be a push towards it.
 """
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec
 from rtctl.types import F64, I64
 
@@ -31,7 +31,7 @@ ENOUGH = 1e-6  # [sqrt(W)] that a bound may be passed by, as acceleration times 
 PAIRS = 64  # links near obstacles or links that are guarded at a time
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def may(bound: float, speed: float, jerk: float) -> float:
     """Return the largest acceleration with which `speed` can still be kept below `bound`."""
     gap = bound - speed
@@ -41,7 +41,7 @@ def may(bound: float, speed: float, jerk: float) -> float:
     return accel
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def may_towards(room: float, speed: float, top: float, braking: float, jerk: float) -> float:
     """Return the largest acceleration towards a limit `room` ahead, at `speed` towards it.
 
@@ -57,7 +57,7 @@ def may_towards(room: float, speed: float, top: float, braking: float, jerk: flo
     return accel
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def joint_bounds(
     A: F64, q: F64, qd: F64, q_min: F64, q_max: F64, qd_max: F64, braking: F64, tau_rate: F64
 ) -> tuple[F64, F64]:
@@ -82,7 +82,7 @@ def joint_bounds(
     return low, high
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def jerk_along(row: F64, mobility: float, tau_rate: F64) -> float:
     """Return the jerk along a row (n,) that a force of the torque rates gives, mobility = row A^-1 row^T [1/kg]."""
     slowest = 1e-9
@@ -91,7 +91,7 @@ def jerk_along(row: F64, mobility: float, tau_rate: F64) -> float:
     return JERK_SHARE * mobility / slowest
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def tip_row(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64) -> tuple[F64, float]:
     """Return the row (n,) along the tip's velocity xd (3,) and the bound of row qdd that keeps |xd| below v_max [m/s].
 
@@ -106,7 +106,7 @@ def tip_row(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64)
     return row, may(v_max, speed, jerk) - drift
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def approach_rows(
     near: I64, link: I64, distances: F64, Jp: F64, own_rho: F64, own_row: F64, dq: F64, A_inv: F64, qd: F64,
     rho0: float, own_stop: float, v_max: float, braking: float, tau_rate: F64,
@@ -157,7 +157,7 @@ def approach_rows(
     return rows[:count], bounds
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _dot(a: F64, b: F64) -> float:
     s = 0.0
     for i in range(a.shape[0]):
@@ -165,7 +165,7 @@ def _dot(a: F64, b: F64) -> float:
     return s
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def guard(A: F64, A_inv: F64, tau: F64, low: F64, high: F64, rows: F64, bounds: F64) -> tuple[F64, bool]:
     """Return the torque (n,) [Nm] whose addition keeps low <= qdd <= high and rows qdd <= bounds, and whether any acts.
 
@@ -191,7 +191,7 @@ def guard(A: F64, A_inv: F64, tau: F64, low: F64, high: F64, rows: F64, bounds: 
     return matvec(A, qdd - wanted), True
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def least_change(A_inv: F64, wanted: F64, C: F64, b: F64) -> F64:
     """Return the x (n,) nearest to `wanted` in the norm of A with C x <= b (Goldfarb and Idnani, dual active set).
 
@@ -239,7 +239,7 @@ def least_change(A_inv: F64, wanted: F64, C: F64, b: F64) -> F64:
     return x
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _shares(C: F64, M: F64, size: F64, active: I64, k: int, fresh: int) -> F64:
     """Return the solution (k,) of (N A^-1 N^T + soft) r = N A^-1 c, N the k active rows, c the fresh one (Cholesky)."""
     L, r = np.empty((k, k)), np.empty(k)
@@ -263,7 +263,7 @@ def _shares(C: F64, M: F64, size: F64, active: I64, k: int, fresh: int) -> F64:
     return r
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def guarded(
     A: F64, A_inv: F64, tau: F64, load: F64, tau_max: F64, low: F64, high: F64, rows: F64, bounds: F64
 ) -> tuple[F64, bool]:
@@ -281,7 +281,7 @@ def guarded(
     return fitting(out, load, tau_max) * out, acts
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def fitting(tau: F64, load: F64, tau_max: F64) -> float:
     """Return the share in (0, 1] of tau (n,) [Nm] that every joint has room for beside its load, at least LEAST_SHARE.
 
@@ -297,7 +297,7 @@ def fitting(tau: F64, load: F64, tau_max: F64) -> float:
     return share
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def yielding(drive: F64, keep: F64, tau_max: F64) -> float:
     """Return the largest share in [0, 1] of drive (n,) [Nm] with which |keep + share drive| <= tau_max at every joint.
 

@@ -1,13 +1,13 @@
 """The field of the arm on itself: links against links, and the joint limits (Khatib 1986)."""
 
 import numpy as np
-from numba import njit
 
 from rtctl.control.firas import CAPPED, CONTACT, FieldParams, LimitParams, firas
+from rtctl.kernel import kernel
 from rtctl.types import F64
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def own_field(rho: F64, row: F64, dq: F64, qd: F64, A_inv: F64, params: FieldParams) -> tuple[F64, float, int]:
     """Repulsion between the watched links of the arm, equal and opposite; returns tau, least distance, flags.
 
@@ -42,7 +42,7 @@ def own_field(rho: F64, row: F64, dq: F64, qd: F64, A_inv: F64, params: FieldPar
     return tau, least, flags
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def joint_limit_field(q: F64, qd: F64, q_min: F64, q_max: F64, A_diag: F64, params: LimitParams, tau: F64) -> int:
     """Repulsion from both limits of every joint; writes tau = A_ii ((a + d) at q_min - (a + d) at q_max).
 

@@ -8,13 +8,13 @@ Sorted for the permitter into what drives towards the goal and what must be kept
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm.field import CAPPED, Field, FieldParams, LimitParams, field, joint_limit_field, own_field
 from rtctl.arm.guards import approach_rows, fitting, guarded, joint_bounds, tip_row, yielding
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
 from rtctl.arm.robot import JOINTS_MAX, Robot
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec
 from rtctl.types import F64, I32, I64, Cut, Record
 from rtctl.world.primitives import Obstacles
@@ -104,7 +104,7 @@ class Law(NamedTuple):
         return self.row(KEEP)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def moved_points(P: F64, Jp: F64, dq: F64) -> F64:
     """Return the PSPs now, P + Jp dq, (r, 3) [m]; dq = q - q of the evaluation.
 
@@ -119,7 +119,7 @@ def moved_points(P: F64, Jp: F64, dq: F64) -> F64:
     return X
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def diagonal(A: F64) -> F64:
     """Return the diagonal (n,) of a matrix (n, n)."""
     out = np.empty(A.shape[0])
@@ -180,7 +180,7 @@ def prepared(robot: Robot) -> Robot:
     return robot._replace(constants=constants)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
     """Return the parameters that `prepared` put into the record c."""
     return (
@@ -204,7 +204,7 @@ def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, Lim
     )  # fmt: skip
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _evaluate(
     constants: Record, radius: F64, link: I64, seen: Field,
     model: Model, space: OperationalSpace, obstacles: Obstacles, q: F64, qd: F64, xd: F64, omega: F64,

@@ -6,9 +6,9 @@ It is small on purpose and knows nothing of goals or obstacles. The drive repeat
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.arm.model import acceleration
+from rtctl.kernel import kernel
 from rtctl.kernel.reductions import largest
 from rtctl.types import F64, Cut
 
@@ -24,7 +24,7 @@ class Permitted(NamedTuple):
     scale: float  # fraction of the driving torque that was left, 1 = all
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _finite(v: F64) -> bool:
     # np.isfinite on each element before any comparison: min/max would turn a NaN into full torque
     good = True
@@ -33,7 +33,7 @@ def _finite(v: F64) -> bool:
     return good
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt: float, lag: int) -> F64:
     """Return the torque (n,) [Nm] from which this tick may move by tau_rate dt.
 
@@ -49,7 +49,7 @@ def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def pulled(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
     """Return whether `slew_reference` left what was sent by more than the rounding of an echo [Nm] on any joint."""
     for i in range(reference.shape[0]):
@@ -58,7 +58,7 @@ def pulled(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
     return False
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _permit(
     drive: F64, keep: F64, qd: F64, reference: F64, tau_max: F64, tau_rate: F64, D: F64, dt: float
 ) -> tuple[F64, F64, int, float]:
@@ -118,7 +118,7 @@ def permit(
     return Permitted(*_permit(drive, keep, qd, reference, tau_max, tau_rate, damping, dt))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def command_torque(
     drive: F64, keep: F64, qd: F64, sent: F64, echo: F64, age: F64, tau_max: F64, tau_rate: F64, tau_lsb: F64, D: F64,
     A_inv: F64, h: F64, g: F64, viscous: F64, dt: float, torque: bool, moving: bool,

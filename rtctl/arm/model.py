@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 
 from rtctl.arm.points import Points
 from rtctl.arm.self_collision import Own
 from rtctl.errors import ConfigError
+from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 
 
@@ -51,7 +51,7 @@ class JointLimits(NamedTuple):
     tau_max: F64  # (n,) [Nm or N]
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def spd_inverse(A: F64) -> F64:
     """Return the inverse of a symmetric positive definite matrix by Cholesky, A = L L^T; NaN where A is not."""
     n = A.shape[0]
@@ -85,7 +85,7 @@ def spd_inverse(A: F64) -> F64:
     return inverse
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _place_points(Rj: F64, tj: F64, link: I64, local: F64, P: F64) -> None:
     """Write the world positions of points fixed in links to P."""
     for i in range(link.shape[0]):
@@ -94,7 +94,7 @@ def _place_points(Rj: F64, tj: F64, link: I64, local: F64, P: F64) -> None:
             P[i, r] = tj[k, r] + Rj[k, r, 0] * local[i, 0] + Rj[k, r, 1] * local[i, 1] + Rj[k, r, 2] * local[i, 2]
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _point_jacobians(Jw: F64, iv: I64, chain: B1, link: I64, P: F64, Jp: F64) -> None:
     """Write the Jacobians of points: column k is v_k + w_k x p of the joint's twist at the world origin."""
     for i in range(link.shape[0]):
@@ -107,7 +107,7 @@ def _point_jacobians(Jw: F64, iv: I64, chain: B1, link: I64, P: F64, Jp: F64) ->
                 Jp[i, 2, k] = Jw[2, c] + Jw[3, c] * py - Jw[4, c] * px
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _quadratic(J: F64, A_inv: F64, used: int, out: F64) -> None:
     """Write J A^-1 J^T, symmetric to the bit, to out (d, d); columns of J (d, n) from `used` on are zero."""
     d = J.shape[0]
@@ -126,7 +126,7 @@ def _quadratic(J: F64, A_inv: F64, used: int, out: F64) -> None:
             out[s, r] = total
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _used(chain: B1, link: int) -> int:
     """Return 1 + the last joint that moves a link, 0 for the base."""
     for k in range(chain.shape[1] - 1, -1, -1):
@@ -135,7 +135,7 @@ def _used(chain: B1, link: int) -> int:
     return 0
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _tip(Jw: F64, dJw: F64, iv: I64, chain: B1, tip: int, x: F64, qd: F64) -> tuple[F64, F64]:
     """Return the tip's Jacobian and velocity product from twists and spatial accelerations at the world origin.
 
@@ -163,7 +163,7 @@ def _tip(Jw: F64, dJw: F64, iv: I64, chain: B1, tip: int, x: F64, qd: F64) -> tu
     return J, Jdqd
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _assemble(
     M: F64, nle: F64, gravity: F64, Jw: F64, dJw: F64, Rj: F64, tj: F64, qd: F64,
     iv: I64, chain: B1, tip: int, tip_R: F64, tip_t: F64,
@@ -199,7 +199,7 @@ def _assemble(
     return A, A_inv, h, g, x, R, J, Jdqd, P, Jp, B, Lambda_inv
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def acceleration(A_inv: F64, tau: F64, h: F64, g: F64, viscous: F64, qd: F64) -> F64:
     """Return qdd (n,) = A^-1 (tau - h - g - B qd), what a torque tau [Nm] makes of a state; NaN where a state is none.
 

@@ -7,8 +7,8 @@ Khatib 1987 (the operational space formulation) and 1986 (the speed-limited goal
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matmul, matvec, symmetric_eigen, tmatvec
 from rtctl.types import F64
 
@@ -42,7 +42,7 @@ class OperationalSpace(NamedTuple):
     damped: bool
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def damped_reciprocal(s: float, epsilon: float) -> float:
     """Return 1/s, smoothly turned to 0 as s falls from epsilon to 0; at most 2.3/epsilon.
 
@@ -58,7 +58,7 @@ def damped_reciprocal(s: float, epsilon: float) -> float:
     return s / (s * s + mu * mu)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _operational_space(
     J: F64, A_inv: F64, Lambda_inv: F64, S: F64, epsilon: float, length: float
 ) -> tuple[F64, F64, F64, float, bool]:
@@ -100,7 +100,7 @@ def operational_space(J: F64, A_inv: F64, Lambda_inv: F64, S: F64, p: MotionPara
     return OperationalSpace(*_operational_space(J, A_inv, Lambda_inv, S, p.epsilon, p.length))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def approach_speed(d: float, k: float, v_max: float, a_max: float) -> float:
     """Return the speed towards a goal at distance d: min(v_max, k d) with its slope bounded by a_max.
 
@@ -112,7 +112,7 @@ def approach_speed(d: float, k: float, v_max: float, a_max: float) -> float:
     return min(v, v_max)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _towards(ref: F64, target: F64, step: float) -> F64:
     """Return ref moved to target by at most `step` along the straight line between them."""
     diff = target - ref
@@ -123,7 +123,7 @@ def _towards(ref: F64, target: F64, step: float) -> F64:
     return moved
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _desired(e: F64, k: float, v_max: float, a_max: float) -> F64:
     d = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     if d < 1e-12:
@@ -132,7 +132,7 @@ def _desired(e: F64, k: float, v_max: float, a_max: float) -> F64:
     return v
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def velocity_reference(
     e: F64,
     e_rot: F64,
@@ -168,7 +168,7 @@ def velocity_reference(
     return _towards(v_ref, v * scale, a_max * dt), _towards(w_ref, w * scale, alpha_max * dt)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def motion_torque(
     J: F64,
     Jdqd: F64,

@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-from numba import njit
-
 from rtctl.arm.estimator import TipEstimate
 from rtctl.arm.task import selected, task_error
+from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, Goal
 
@@ -22,7 +21,7 @@ class Progress(NamedTuple):
     rate: float  # [rad/s] of the tip, 0 for a position task
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _progress(
     task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64, xd: F64, omega: F64
 ) -> tuple[float, float, float, float]:

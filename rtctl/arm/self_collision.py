@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import coal
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 
 
@@ -64,7 +64,7 @@ class Own:
         return rho, rows
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _bounds(pairs: I64, link: I64, centre: F64, radius: F64, Rj: F64, tj: F64) -> F64:
     """Return a lower bound (L,) [m] of each pair's distance from the balls around the hulls."""
     world = np.empty((link.shape[0], 3))
@@ -83,7 +83,7 @@ def _bounds(pairs: I64, link: I64, centre: F64, radius: F64, Rj: F64, tj: F64) -
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _gradient(n: F64, a: F64, b: F64, far: int, near: int, Jw: F64, iv: I64, chain: B1, row: F64) -> None:
     """Write n^T (J_a - J_b) to row (n,): a on link `far`, b on link `near`, n from b to a."""
     for k in range(iv.shape[0]):

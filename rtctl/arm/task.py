@@ -7,8 +7,8 @@ World axes, [linear; angular]. The selection S (k, 6) has orthonormal rows.
 import math
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
 from rtctl.kernel.rotations import R_of, error_to
 from rtctl.types import F64, Goal, Task
@@ -18,7 +18,7 @@ _TURNS = _ORIENTATION | _DIRECTION
 _SMALL = 1e-4  # series below, closed form above; see so3
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _cross(a: F64, b: F64) -> F64:
     out = np.empty(3)
     out[0] = a[1] * b[2] - a[2] * b[1]
@@ -27,7 +27,7 @@ def _cross(a: F64, b: F64) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _across(a: F64) -> F64:
     """Return a unit vector perpendicular to the unit vector a (3,): across the axis that a is furthest from."""
     least = np.zeros(3)
@@ -41,7 +41,7 @@ def _across(a: F64) -> F64:
     return unit
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _turned(R: F64, v: F64) -> F64:
     """Return R v."""
     out = np.empty(3)
@@ -50,7 +50,7 @@ def _turned(R: F64, v: F64) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def between(a: F64, b: F64) -> F64:
     """Return the rotation vector (3,) [rad] of the shortest turn of unit vector a to unit vector b.
 
@@ -68,7 +68,7 @@ def between(a: F64, b: F64) -> F64:
     return full
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def selection(task: int, axis: F64, R: F64) -> F64:
     """Return S (k, 6): the unit rows of the task's axes; for a direction the two turns that move the tool's axis.
 
@@ -91,7 +91,7 @@ def selection(task: int, axis: F64, R: F64) -> F64:
     return S[:k].copy()
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def selected(task: int, axis: F64, R: F64, v: F64, w: F64) -> tuple[F64, F64]:
     """Return linear v and angular w, both (3,), without what the task leaves free: S^T S [v; w]."""
     out, turn = np.zeros(3), np.zeros(3)
@@ -108,7 +108,7 @@ def selected(task: int, axis: F64, R: F64, v: F64, w: F64) -> tuple[F64, F64]:
     return out, turn
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def task_error(task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64) -> tuple[F64, F64]:
     """Return the errors e (3,) [m] and e_rot (3,) [rad] of the tip at x, R against a goal, zero where it is free."""
     if task & _DIRECTION:

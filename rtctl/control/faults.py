@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from numba import njit
-
+from rtctl.kernel import kernel
 from rtctl.types import I64, Severity
 
 GOOD_TICKS = 50  # an automatic fault clears after this many ticks without it
@@ -19,7 +18,7 @@ class Fault(NamedTuple):
     text: str
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def latch_with(present: int, latched: int, good: I64, automatic: int) -> tuple[int, I64]:
     """Return what `latch` does, for a table whose faults in the bits `automatic` clear by themselves."""
     out = good + 1

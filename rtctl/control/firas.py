@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import ieee_kernel
 from rtctl.types import F64, I64
 
 CAP_SHARE = 0.5  # of the clearance, where the repulsion is capped at the latest
@@ -126,7 +126,7 @@ def limit_params(qd_max: F64, rho0: F64, rho_min: F64, dt: float, damping_ratio:
 
 
 # error_model: every divisor is a validated parameter or bounded by one; the check for zero would stop vectorisation.
-@njit(cache=True, fastmath=False, error_model="numpy")
+@ieee_kernel
 def firas(
     rho: float, rho_dot: float, rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float
 ) -> tuple[float, float]:

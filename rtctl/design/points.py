@@ -8,13 +8,13 @@ corners do, so the cover is complete by proof and not by sampling.
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
 from rtctl.design.solids import EDGE, STEP, Solid, areas, depth, solids_of, surface
 from rtctl.errors import ConfigError
+from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 
 _GRID = 0.012  # [m] between candidate centres, at most half the overhang
@@ -96,7 +96,7 @@ def coverage(points: Points, body: RigidBody, edge: float = EDGE) -> Coverage:
     return Coverage(covered / area if area else 0.0, protrusion, overhang, tuple(dict.fromkeys(bare)))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _need2(centres: F64, samples: F64, triangles: I64) -> F64:
     """Return the squared radius (k, t) of the ball about each centre that just holds each triangle's corners."""
     need = np.empty((centres.shape[0], triangles.shape[0]))
@@ -110,7 +110,7 @@ def _need2(centres: F64, samples: F64, triangles: I64) -> F64:
     return need
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _greedy(covers: B1, weight: I64, open_: B1) -> I64:
     """Return the rows that cover what is open, the largest weight first; what no row covers stays open."""
     chosen: list[int] = []

@@ -4,12 +4,12 @@ BLAS picks its kernels by CPU and so changes last bits between machines; replay 
 """
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import F64
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def matvec(M: F64, v: F64) -> F64:
     """Return M v, (r, c) by (c,)."""
     out = np.zeros(M.shape[0])
@@ -19,7 +19,7 @@ def matvec(M: F64, v: F64) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def tmatvec(M: F64, v: F64) -> F64:
     """Return M^T v, (r, c) by (r,)."""
     out = np.zeros(M.shape[1])
@@ -29,7 +29,7 @@ def tmatvec(M: F64, v: F64) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def matmul(P: F64, Q: F64) -> F64:
     """Return P Q, (r, k) by (k, c)."""
     out = np.zeros((P.shape[0], Q.shape[1]))
@@ -40,7 +40,7 @@ def matmul(P: F64, Q: F64) -> F64:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def symmetric_eigen(S: F64) -> tuple[F64, F64]:
     """Return eigenvalues (m,) and eigenvectors in columns (m, m) of a symmetric S by cyclic Jacobi.
 

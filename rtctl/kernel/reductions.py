@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def any_set(flags: B1) -> bool:
     """Return whether any flag is set."""
     for i in range(flags.shape[0]):
@@ -17,7 +17,7 @@ def any_set(flags: B1) -> bool:
     return False
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def any_below(values: F64, bound: float) -> bool:
     """Return whether any value is below the bound; a NaN is not."""
     for i in range(values.shape[0]):
@@ -26,7 +26,7 @@ def any_below(values: F64, bound: float) -> bool:
     return False
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def all_equal(values: I64, wanted: int) -> bool:
     """Return whether every value is the wanted one."""
     for i in range(values.shape[0]):
@@ -35,7 +35,7 @@ def all_equal(values: I64, wanted: int) -> bool:
     return True
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def largest(values: F64) -> float:
     """Return the largest value; a NaN is passed over unless it comes first."""
     out: float = values[0]
@@ -44,7 +44,7 @@ def largest(values: F64) -> float:
     return out
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def norm(v: F64) -> float:
     """Return the Euclidean length."""
     s = 0.0
@@ -53,7 +53,7 @@ def norm(v: F64) -> float:
     return math.sqrt(s)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def norms(rows: F64) -> F64:
     """Return the Euclidean length of each row of (r, c)."""
     out = np.empty(rows.shape[0])

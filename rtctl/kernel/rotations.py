@@ -6,15 +6,15 @@ Compiled, and valid as plain Python; no BLAS, so that bits repeat on every machi
 import math
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import F64
 
 # Below this the series is exact to double precision (next term of order 1e-18), above it the closed form is.
 _SMALL = 1e-4
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def exp3(w: F64) -> F64:
     """Return the rotation matrix of a rotation vector, R = I + s [w] + c [w]^2 (Rodrigues).
 
@@ -43,7 +43,7 @@ def exp3(w: F64) -> F64:
     return R
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def quat_of(R: F64) -> F64:
     """Return the unit quaternion wxyz of a rotation matrix, w >= 0 (Shepperd: divide by the largest component).
 
@@ -78,7 +78,7 @@ def quat_of(R: F64) -> F64:
     return q
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def R_of(wxyz: F64) -> F64:
     """Return the rotation matrix of a quaternion of any non-zero length.
 
@@ -99,7 +99,7 @@ def R_of(wxyz: F64) -> F64:
     return R
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def log3(R: F64) -> F64:
     """Return the rotation vector of a rotation matrix, 2 atan2(|v|, w) v/|v|; at pi either of the two axes.
 
@@ -115,7 +115,7 @@ def log3(R: F64) -> F64:
     return w
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def compose(A: F64, B: F64) -> F64:
     """Return the product A B of two (3, 3) matrices, without BLAS."""
     C = np.empty((3, 3))
@@ -125,7 +125,7 @@ def compose(A: F64, B: F64) -> F64:
     return C
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def error(R: F64, R_goal: F64) -> F64:
     """Return the rotation vector, in the world frame, that takes R to R_goal: log(R_goal R^T).
 
@@ -138,13 +138,13 @@ def error(R: F64, R_goal: F64) -> F64:
     return log3(D)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def error_to(R: F64, wxyz: F64) -> F64:
     """Return `error` of R (3, 3) against the orientation of a quaternion (4,)."""
     return error(R, R_of(wxyz))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def orthonormal(R: F64) -> F64:
     """Return the rotation nearest to a matrix that drifted from SO(3) by rounding (through its quaternion)."""
     return R_of(quat_of(R))

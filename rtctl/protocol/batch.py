@@ -6,8 +6,8 @@ Only a whole and healthy cycle is taken here; anything else is for the patient c
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.protocol import e2e, frame, mit
 from rtctl.types import F64, I64, U8
 
@@ -83,7 +83,7 @@ def encode(cycle: Cycle, tau: F64, counters: I64) -> list[bytes]:
     return [raw[at : at + size] for at in range(0, len(raw), size)]
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _crc(data: U8, can_id: int) -> int:
     crc: int = 0xFFFF
     for i in range(e2e.COVERED):
@@ -92,7 +92,7 @@ def _crc(data: U8, can_id: int) -> int:
     return int((crc << 8 & 0xFFFF) ^ _TABLE[crc >> 8 ^ (can_id & 0xFF)])
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _decode(frames: U8, protected: bool, scale: F64, can_id: I64, words: U8, last: I64) -> tuple[bool, F64, I64]:
     n = frames.shape[0]
     state, codes, seen = np.empty((3, n)), np.zeros((5, n), np.int64), np.zeros(n, np.bool_)
@@ -125,7 +125,7 @@ def _decode(frames: U8, protected: bool, scale: F64, can_id: I64, words: U8, las
     return True, state, codes
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _encode(out: U8, protected: bool, scale: F64, can_id: I64, tau: F64, counters: I64) -> None:
     for j in range(out.shape[0]):
         t_max = scale[j, 2]

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rtctl.control.firas import firas
+from rtctl.kernel import kernel
 from rtctl.rover.robot import Base
 from rtctl.types import F64
 from rtctl.world.primitives import Obstacles, distances_into
@@ -60,7 +60,7 @@ def ahead_of(base: Base, x: F64, yaw: float, sent: F64) -> tuple[F64, float]:
     return _ahead_of(x, yaw, sent, base.margins.lag / base.dt, base.margins.turn_lag / base.dt, base.dt)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _ahead_of(x: F64, yaw: float, sent: F64, lag: float, turn_lag: float, dt: float) -> tuple[F64, float]:
     px, py = x[0], x[1]
     for k in range(sent.shape[0] - 1, -1, -1):  # the oldest first
@@ -88,7 +88,7 @@ def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, now: int, obstacles
     return Push(push, told[0], rho_seen, told[1], told[2], told[3])
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _seen(
     points: F64, radius: F64, v: F64, seen: F64, now: int,
     rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float,
@@ -121,7 +121,7 @@ def _seen(
     return out, nearest
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _told(
     points: F64, radius: F64, v: F64, obstacles: Obstacles, height: float,
     rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float, look_ahead: float,
@@ -228,7 +228,7 @@ def spend(gap: float, brake: float, lag: float) -> float:
     return -brake * lag + math.sqrt((brake * lag) ** 2 + 2.0 * brake * gap)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _gap_seen(x: F64, e: F64, r: float, seen: F64) -> float:
     """Return how far [m] a circle of radius r about x can move along e until a return touches it."""
     gap = math.inf
@@ -241,7 +241,7 @@ def _gap_seen(x: F64, e: F64, r: float, seen: F64) -> float:
     return gap
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _gap_told(x: F64, e: F64, r: float, height: float, obstacles: Obstacles, horizon: float) -> float:
     """Return the same for told obstacles: steps as long as the free distance never jump over one."""
     slots = obstacles.active.shape[0]

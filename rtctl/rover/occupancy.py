@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into
 
@@ -74,7 +74,7 @@ def looked(chart: Chart, x: F64, yaw: float, scan: F64, start: float, step: floa
     return chart._replace(cells=cells)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float) -> None:
     count, turn = scan.shape[0], 2.0 * math.pi
     half = int(reach / CELL) + 1
@@ -122,7 +122,7 @@ def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
     return field
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _free(cells: U8Grid, origin: I64, obstacles: Obstacles, height: float, field: F64) -> None:
     far = STENCIL * CELL
     field[:] = far
@@ -155,7 +155,7 @@ def returns_near(chart: Chart, x: F64, reach: float) -> F64:
     return _near(chart.cells, chart.origin, x, reach)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _near(cells: U8Grid, origin: I64, x: F64, reach: float) -> F64:
     half = int(reach / CELL) + 1
     ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]

@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.rover.occupancy import CELL, SIZE
 from rtctl.types import F64, I64
 
@@ -56,7 +56,7 @@ def remaining(free: F64, origin: I64, x: F64, way: Way, room: float) -> Way:
     return Way(rest, _length(x, rest), way.short)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _length(x: F64, corners: F64) -> float:
     total, px, py = 0.0, x[0], x[1]
     for k in range(corners.shape[0]):
@@ -65,7 +65,7 @@ def _length(x: F64, corners: F64) -> float:
     return total
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _passed(free: F64, origin: I64, x: F64, corners: F64, room: float) -> int:
     """Return how many corners lie behind: the last one in sight is the next; -1 when none is or the rest is closed."""
     n, first = corners.shape[0], -1
@@ -78,7 +78,7 @@ def _passed(free: F64, origin: I64, x: F64, corners: F64, room: float) -> int:
     return first
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _clear(free: F64, origin: I64, ax: float, ay: float, bx: float, by: float, room: float) -> bool:
     """Return whether the straight line keeps `room` [m]; where it begins with less it may only gain until it has it."""
     length = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
@@ -101,7 +101,7 @@ def _clear(free: F64, origin: I64, ax: float, ay: float, bx: float, by: float, r
         s = min(s + max(0.5 * CELL, 0.9 * (d - room)), length)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _search(free: F64, origin: I64, x: F64, goal: F64, room: float) -> tuple[F64, int, float]:
     """A* over cells, then the string pulled taut: (corners (CORNERS, 2), their number, distance short of the goal)."""
     n = SIZE * SIZE
@@ -144,7 +144,7 @@ def _search(free: F64, origin: I64, x: F64, goal: F64, room: float) -> tuple[F64
     return _taut(free, origin, x, goal, room, parent, end if reached else best, reached, short)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _taut(
     free: F64, origin: I64, x: F64, goal: F64, room: float, parent: I64, end: int, reached: bool, short: float
 ) -> tuple[F64, int, float]:

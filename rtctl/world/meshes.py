@@ -8,9 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
+from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 from rtctl.world.tree import HEAD, TRIANGLES_PER_LEAF, fill_boxes, leaves_for, ordered
 
@@ -138,7 +138,7 @@ def _normals(V: F64, T: I64) -> tuple[F64, F64, F64]:
     return faces, edges, _unit(total)[T]
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def winding(V: F64, T: I64, X: F64) -> F64:
     """Return how often the surface winds about points X (m, 3), 1 inside, 0 outside (van Oosterom, Strackee 1983)."""
     turns = np.zeros(X.shape[0])

@@ -4,9 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from rtctl.kernel import reductions
+from rtctl.kernel import kernel, reductions
 from rtctl.types import B1, F64, ObstacleEdit, Shape
 from rtctl.world import meshes
 from rtctl.world.meshes import Meshes
@@ -143,7 +142,7 @@ def _with_margins(world: World) -> World:
     return world._replace(obstacles=world.obstacles._replace(margin=margin))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _margins(margin: F64, age: F64, moving: B1, creep: float, stale: float, dt: float) -> F64:
     out = np.zeros_like(margin)
     for k in range(margin.shape[0]):
@@ -160,7 +159,7 @@ def advanced(world: World, dt: float) -> World:
     return world._replace(obstacles=world.obstacles._replace(p=p, R=R, margin=margin), age=age)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _advanced(
     obstacles: Obstacles, age: F64, moving: B1, creep: float, stale: float, dt: float
 ) -> tuple[F64, F64, F64, F64]:
@@ -180,7 +179,7 @@ def distance_from(world: World, x: F64) -> F64:
     return _distance_from(x, world.obstacles)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _distance_from(x: F64, obstacles: Obstacles) -> F64:
     slots = obstacles.active.shape[0]
     out = np.empty((slots, 4, 1))
@@ -193,7 +192,7 @@ def oldest(world: World) -> float:
     return _oldest(world.age, world.moving)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _oldest(age: F64, moving: B1) -> float:
     oldest = 0.0
     for k in range(age.shape[0]):

@@ -23,8 +23,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.kernel.rotations import R_of, compose, exp3
 from rtctl.types import B1, F64, I64, Shape
 from rtctl.world import distance as exact
@@ -219,7 +219,7 @@ def advance(obstacles: Obstacles, dt: float) -> Obstacles:
     return obstacles._replace(p=p, R=R)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def advanced_pose(active: B1, p: F64, R: F64, v: F64, w: F64, dt: float) -> tuple[F64, F64]:
     """Return new (p, R) of the active slots; the others are carried over."""
     p, R = p.copy(), R.copy()
@@ -232,7 +232,7 @@ def advanced_pose(active: B1, p: F64, R: F64, v: F64, w: F64, dt: float) -> tupl
     return p, R
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def speed_bound(obstacles: Obstacles) -> float:
     """Return a bound on the speed [m/s] of any surface point of any active obstacle; infinite for a turning plane."""
     bound = 0.0
@@ -247,14 +247,14 @@ def speed_bound(obstacles: Obstacles) -> float:
     return bound
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _reach(dims: F64) -> float:
     """Return a radius about the frame that holds a primitive of any kind with these dims (the sum bounds them all)."""
     reach: float = dims[0] + dims[1] + dims[2]
     return reach
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _measure(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, j: int, out: F64) -> None:
     """Write the true distance and normal of point j to the superquadric in slot k."""
     dx, dy, dz = P[0, j] - p[k, 0], P[1, j] - p[k, 1], P[2, j] - p[k, 2]
@@ -267,7 +267,7 @@ def _measure(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, j: int, out
         out[k, 1 + i, j] = R[k, i, 0] * e + R[k, i, 1] * f + R[k, i, 2] * g
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _superquadric(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, cutoff: float, out: F64) -> None:
     """Distances to a superquadric behind a pre-filter: its bounding box, vectorised, is never farther than itself.
 
@@ -289,7 +289,7 @@ def _superquadric(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, cutoff
             _measure(P, radius, R, p, dims, k, j, out)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def distances_into(P: F64, radius: F64, obstacles: Obstacles, cutoff: float, out: F64) -> None:
     """Write the distances of points to every active obstacle, obstacle-outer, point-inner.
 

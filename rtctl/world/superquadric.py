@@ -12,14 +12,14 @@ inside. The shortcuts, radial distance and f/|grad f|, are wrong by factors of 4
 
 import math
 
-from numba import njit
+from rtctl.kernel import kernel
 
 _FLAT = 1e-10  # |sum X^p - 1| below which the first-order distance is exact to 1e-20 of the size
 _NONE = 2.0  # "this coordinate would leave the box": any value above 1 reads as outside the surface
 _SAMPLES = 12  # per axis, inside: brackets of stationary points; tests hold the result to dense sampling
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def ellipsoid(x: float, y: float, z: float, a: float, b: float, c: float) -> tuple[float, float, float, float]:
     """Return (signed distance, unit outward normal) of a local point to the ellipsoid x^2/a^2 + y^2/b^2 + z^2/c^2 = 1.
 
@@ -56,7 +56,7 @@ def ellipsoid(x: float, y: float, z: float, a: float, b: float, c: float) -> tup
     )
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _power(t: float, p: float) -> float:
     """Return t^p for t >= 0, p >= 0: by squaring where p is whole (five times faster), else by libm."""
     n = int(p)
@@ -71,7 +71,7 @@ def _power(t: float, p: float) -> float:
     return r
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def n_surface(
     x: float, y: float, z: float, a: float, b: float, c: float, p: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -99,7 +99,7 @@ def n_surface(
     return distance, math.copysign(u / norm, x), math.copysign(v / norm, y), math.copysign(w / norm, z)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _falling(X: float, k: float, p: float) -> float:
     """Return the root t in [0, X] of t + k t^(p-1) = X, k > 0: convex and rising, so Newton from above is monotone."""
     if X == 0.0 or k < 1e-280:
@@ -119,7 +119,7 @@ def _falling(X: float, k: float, p: float) -> float:
     return t
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _rate(t: float, k: float, p: float) -> float:
     """Return -d(t^p)/d(log mu) of the root of `_falling`, >= 0."""
     if t <= 0.0:
@@ -128,7 +128,7 @@ def _rate(t: float, k: float, p: float) -> float:
     return p * _power(t, p) * r / (1.0 + (p - 1.0) * r)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _least_mu(X: float, s: float, c: float, p: float) -> float:
     """Return the mu at which t = X/s, or infinity where the axis carries nothing."""
     t = X / s
@@ -138,7 +138,7 @@ def _least_mu(X: float, s: float, c: float, p: float) -> float:
     return (X - t) / (c * power)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _start(X: float, Y: float, Z: float, ca: float, cb: float, cc: float, p: float, pz: float) -> float:
     """Return a lower bound of mu from outside, tight near the surface and far away: there every t <= 1 and g >= 1.
 
@@ -162,7 +162,7 @@ def _start(X: float, Y: float, Z: float, ca: float, cb: float, cc: float, p: flo
     return max(least, (X - 1.0) / ca, (Y - 1.0) / cb, (Z - 1.0) / cc)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _outside(
     X: float, Y: float, Z: float, a: float, b: float, c: float, p: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -199,7 +199,7 @@ def _outside(
     )
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _rising(X: float, k: float, p: float) -> float:
     """Return the smaller root t in [X, 1] of t - k t^(p-1) = X, or _NONE: concave, so Newton from below is monotone."""
     if X == 0.0 or k == 0.0:
@@ -220,7 +220,7 @@ def _rising(X: float, k: float, p: float) -> float:
     return t
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _excess(
     t: float, X: float, Y: float, Z: float, ca: float, cb: float, cc: float, pa: float, pb: float, pc: float
 ) -> tuple[float, float, float]:
@@ -232,7 +232,7 @@ def _excess(
     return _power(t, pa) + _power(u, pb) + _power(v, pc) - 1.0, u, v
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _root(
     lo: float, hi: float, X: float, Y: float, Z: float, ca: float, cb: float, cc: float, pa: float, pb: float, pc: float
 ) -> tuple[float, float, float]:
@@ -259,7 +259,7 @@ def _root(
     return t, u, v
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _scaled(
     t: float, u: float, v: float, X: float, Y: float, Z: float, a: float, b: float, c: float, p: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -276,7 +276,7 @@ def _scaled(
     return math.sqrt(e * e + f * f + g * g), t, u, v
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _along(
     X: float, Y: float, Z: float, a: float, b: float, c: float, pa: float, pb: float, pc: float, order: int, most: float
 ) -> tuple[float, float, float, float]:
@@ -309,7 +309,7 @@ def _along(
     return best, bt, bu, bv
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _to_face(X: float, Y: float, Z: float, a: float, pa: float, pb: float, pc: float) -> tuple[float, float]:
     """Return (distance to the surface along axis a, its coordinate t there): an upper bound of the depth."""
     t = math.pow(max(0.0, 1.0 - _power(Y, pb) - _power(Z, pc)), 1.0 / pa)
@@ -317,7 +317,7 @@ def _to_face(X: float, Y: float, Z: float, a: float, pa: float, pb: float, pc: f
     return a * (t - X), t
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _inside(
     X: float, Y: float, Z: float, a: float, b: float, c: float, p: float, pz: float
 ) -> tuple[float, float, float, float]:

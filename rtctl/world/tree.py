@@ -14,8 +14,8 @@ stand. So whoever sends a cloud may sort it, and need not be trusted to have don
 import math
 
 import numpy as np
-from numba import njit
 
+from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 
 HEAD = 4
@@ -34,7 +34,7 @@ def boxes_of(body: F64, most: int) -> F64:
     return boxes[np.all(boxes[:, :3] <= boxes[:, 3:], axis=1)]  # a leaf without items has none
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def leaves_for(count: int, per_leaf: int) -> int:
     """Return the least power of two of leaves that hold at most `per_leaf` items each."""
     leaves = 1
@@ -43,7 +43,7 @@ def leaves_for(count: int, per_leaf: int) -> int:
     return leaves
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _select(X: F64, axis: int, order: I64, low: int, high: int, k: int) -> None:
     """Arrange order[low:high] so that nothing before place k lies above anything from it on (Hoare's selection)."""
     high -= 1
@@ -67,7 +67,7 @@ def _select(X: F64, axis: int, order: I64, low: int, high: int, k: int) -> None:
             return
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def ordered(X: F64, per_leaf: int) -> I64:
     """Return the order (n,) of finite points X (n, 3) that makes small boxes: halves along the longest side."""
     n = X.shape[0]
@@ -89,7 +89,7 @@ def ordered(X: F64, per_leaf: int) -> I64:
     return order
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def fill_boxes(body: F64) -> None:
     """Make the boxes of a body, and its reach, from its head and its items."""
     n, leaves, width = int(body[0]), int(body[1]), int(body[3])
@@ -113,7 +113,7 @@ def fill_boxes(body: F64) -> None:
     body[2] = math.sqrt(reach2)
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def cloud_body(steps: I64, step: float) -> F64:
     """Return the body of points `step` [m] times whole numbers `steps` (3 n,), n >= 1, in the order in which they come.
 
@@ -130,7 +130,7 @@ def cloud_body(steps: I64, step: float) -> F64:
     return body
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _box2(body: F64, at: int, x: float, y: float, z: float) -> float:
     """Return the squared distance to the box at `at`, 0 inside."""
     e, f = body[at] - x, x - body[at + 3]
@@ -142,7 +142,7 @@ def _box2(body: F64, at: int, x: float, y: float, z: float) -> float:
     return d * d + g * g + h * h
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _foot(body: F64, at: int, x: float, y: float, z: float) -> tuple[float, float, float, int]:
     """Return the point of a triangle nearest to (x, y, z), and where it lies: 0 face, 1-3 edges ab bc ca, 4-6 corners.
 
@@ -181,7 +181,7 @@ def _foot(body: F64, at: int, x: float, y: float, z: float) -> tuple[float, floa
     return ax + s * ux + t * wx, ay + s * uy + t * wy, az + s * uz + t * wz, 0
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _in_leaf(body: F64, at: int, stop: int, width: int, x: float, y: float, z: float, best: float) -> tuple[float, int]:
     """Return (squared distance, place) of the nearest item of a leaf if it is nearer than `best`, else (best, -1)."""
     found = -1
@@ -196,7 +196,7 @@ def _in_leaf(body: F64, at: int, stop: int, width: int, x: float, y: float, z: f
     return best, found
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _nearest(body: F64, o: int, x: float, y: float, z: float, most: float, nodes: I64, keys: F64) -> tuple[float, int]:
     """Return (squared distance, place in `body`) of the nearest item of the body at `o`, (most, -1) if none is nearer.
 
@@ -230,7 +230,7 @@ def _nearest(body: F64, o: int, x: float, y: float, z: float, most: float, nodes
         node = nodes[top]
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _side(body: F64, o: int, item: int, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Return (signed distance, unit outward normal) of a point whose nearest triangle is at `item`.
 
@@ -250,7 +250,7 @@ def _side(body: F64, o: int, item: int, x: float, y: float, z: float) -> tuple[f
     return sign * d, nx, ny, nz
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def _measure(
     P: F64, radius: F64, R: F64, p: F64, k: int, j: int, body: F64, o: int, grown: float, limit: float,
     nodes: I64, keys: F64, out: F64,
@@ -278,7 +278,7 @@ def _measure(
         out[k, 1 + i, j] = R[k, i, 0] * e + R[k, i, 1] * f + R[k, i, 2] * g
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def many(P: F64, radius: F64, R: F64, p: F64, k: int, body: F64, o: int, grown: float, cutoff: float, out: F64) -> None:
     """Distances of points to the cloud or mesh at `body[o:]`, in slot k, whose items are `grown` [m] thick.
 
