@@ -1,6 +1,7 @@
 """The structure of the program, read from its own imports: no circle, wherever an import stands."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -66,3 +67,35 @@ def test_a_circle_is_found():
 def test_no_circle_is_hidden_in_a_function_or_from_type_checkers(package):
     known = modules(package)
     assert circles({name: imports(known, name) for name in known}) == []
+
+
+def walks() -> dict[str, list[tuple[str, str]]]:
+    """Return the walks of ARCHITECTURE.md: heading -> (file, function) of each step."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    part = text.split("## Three walks", 1)[1].split("\n## ", 1)[0]
+    found = {}
+    for section in part.split("\n### ")[1:]:
+        heading, _, body = section.partition("\n")
+        found[heading] = re.findall(r"`([\w/]+\.py):(\w+)`", body)
+    return found
+
+
+@pytest.mark.parametrize(("heading", "steps"), walks().items())
+def test_every_step_of_a_walk_exists(heading, steps):
+    assert len(steps) >= 5, heading
+    for file, function in steps:
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        assert function in defined, f"{file}:{function}"
+
+
+def test_there_are_three_and_a_frame_needs_at_most_twelve_files():
+    assert len(walks()) == 3
+    assert len({file for file, _ in walks()["A CAN frame becomes a torque"]}) <= 12
+
+
+def test_the_map_names_every_room():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    for path in sorted((ROOT / "rtctl").iterdir()):
+        if path.is_dir() and (path / "__init__.py").exists():
+            assert f"`rtctl/{path.name}/`" in text, path.name

@@ -255,11 +255,11 @@ def test_a_wrong_call_is_one_line(arguments: list[str], complaint: str, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_every_experiment_is_listed_and_has_its_picture_in_the_readme(capsys):
+def test_every_experiment_is_listed_and_has_its_picture_on_its_page(capsys):
     assert main(["experiment", "--list"]) == 0
     listed = [row.split()[0] for row in capsys.readouterr().out.splitlines()]
     assert listed == list(experiment.NAMES)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "experiments.md").read_text(encoding="utf-8")
     for name in listed:
-        assert f"docs/{name}.png" in readme, name
+        assert f"({name}.png)" in page, name
         assert (ROOT / "docs" / f"{name}.png").stat().st_size < 150_000, name

@@ -1,7 +1,7 @@
 """The fault table: what can go wrong at run time, how it is seen, and what the arm does about it.
 
 Faults are values. Each tick `detect` says which are present; `latch` keeps those that only an operator may clear.
-The row numbers are those of the published catalogue; README prints its table from FAULTS.
+The row numbers are those of the published catalogue; docs/faults.md has the table that is printed from FAULTS.
 """
 
 from typing import NamedTuple
