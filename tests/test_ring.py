@@ -148,6 +148,7 @@ def test_an_entry_that_makes_no_sense_ends_the_taking_but_not_the_consumer(make:
 def test_a_file_that_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "other"
     path.write_bytes(content)
+    path.chmod(0o600)
     with pytest.raises(LinkError):
         attach(path)
 
@@ -165,7 +166,7 @@ def test_the_ring_goes_to_the_next_folder_when_one_does_not_take_it(tmp_path: Pa
 CONSUMER = """
 import sys, hashlib
 from pathlib import Path
-from rtctl.hal import ring as rings
+from rtctl.log.record import ring as rings
 consumer = rings.attach(Path(sys.argv[1]))
 digest, count = hashlib.sha256(), 0
 while True:
@@ -201,7 +202,7 @@ def test_another_process_sees_every_byte_while_the_ring_wraps(tmp_path: Path) ->
 PRODUCER = """
 import sys, os
 from pathlib import Path
-from rtctl.hal import ring as rings
+from rtctl.log.record import ring as rings
 producer = rings.create("a.ring", 1 << 20, b"", [Path(sys.argv[1])])
 number = 0
 while True:

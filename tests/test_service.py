@@ -5,14 +5,17 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from configparser import ConfigParser
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rtctl.errors import EXIT_CONFIG, ConfigError
 from rtctl.hal.service import InstanceLock, Service, bus_resource
+from tests.strangers import STRANGER, stranger
 
 ROOT = Path(__file__).parent.parent
 
@@ -100,51 +103,86 @@ def test_a_manager_that_does_not_read_never_blocks_the_loop(manager: Manager) ->
 
 
 def test_a_second_master_of_a_bus_is_refused_by_name(tmp_path: Path) -> None:
-    with InstanceLock("socketcan:can0", "link.channel", str(tmp_path)):
-        with pytest.raises(ConfigError, match=f"link.channel: .*process {os.getpid()}") as caught:
-            InstanceLock("socketcan:can0", "link.channel", str(tmp_path))
-        InstanceLock("socketcan:can1", "link.channel", str(tmp_path)).close()
+    bus, other = f"socketcan:can0@{tmp_path}", f"socketcan:can1@{tmp_path}"
+    with InstanceLock(bus, "link.channel"):
+        with pytest.raises(ConfigError, match=f"link.channel: .*process {os.getpid()} of user ") as caught:
+            InstanceLock(bus, "link.channel")
+        InstanceLock(other, "link.channel").close()
     assert caught.value.exit_code == EXIT_CONFIG
-    InstanceLock("socketcan:can0", "link.channel", str(tmp_path)).close()  # free again
+    InstanceLock(bus, "link.channel").close()  # free again
 
 
 HOLD = """
 import sys, time
 from rtctl.hal.service import InstanceLock
-lock = InstanceLock("bus", "link.channel", sys.argv[1])
+lock = InstanceLock(sys.argv[1], "link.channel")
 print("held", flush=True)
 time.sleep(60)
 """
 
 
-def test_the_lock_of_a_killed_process_is_free_at_once(tmp_path: Path) -> None:
-    child = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, cwd=ROOT)
+@contextmanager
+def held(bus: str, **how: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Let another process hold the lock of a bus."""
+    child = subprocess.Popen([sys.executable, "-c", HOLD, bus], stdout=subprocess.PIPE, cwd=ROOT, **how)
     assert child.stdout is not None
-    assert child.stdout.readline() == b"held\n"
-    with pytest.raises(ConfigError, match=f"process {child.pid}"):
-        InstanceLock("bus", "link.channel", str(tmp_path))
-    child.send_signal(signal.SIGKILL)
-    child.wait()
-    child.stdout.close()
-    InstanceLock("bus", "link.channel", str(tmp_path)).close()
+    try:
+        assert child.stdout.readline() == b"held\n"
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        child.stdout.close()
+
+
+def test_the_lock_of_a_killed_process_is_free_at_once(tmp_path: Path) -> None:
+    bus = str(tmp_path)
+    with held(bus) as child:
+        with pytest.raises(ConfigError, match=f"process {child.pid}"):
+            InstanceLock(bus, "link.channel")
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+        InstanceLock(bus, "link.channel").close()
 
 
 def test_a_child_of_the_holder_does_not_inherit_the_lock(tmp_path: Path) -> None:
-    lock = InstanceLock("bus", "link.channel", str(tmp_path))
+    lock = InstanceLock(str(tmp_path), "link.channel")
     words = [sys.executable, "-c", "print('up', flush=True); input()"]
     child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, close_fds=False)
     assert child.stdout is not None
     assert child.stdout.readline() == b"up\n"  # before it runs, the kernel may still be closing what it must not keep
     lock.close()
-    InstanceLock("bus", "link.channel", str(tmp_path)).close()
+    InstanceLock(str(tmp_path), "link.channel").close()
     child.communicate(b"\n")
 
 
-def test_names_that_look_alike_are_locked_apart_and_unusable_places_are_named(tmp_path: Path) -> None:
-    with InstanceLock("a/b", "x", str(tmp_path)), InstanceLock("a-b", "x", str(tmp_path)):
-        assert len(list(tmp_path.iterdir())) == 2
-    with pytest.raises(ConfigError, match=r"link\.channel: .*No such file"):
-        InstanceLock("bus", "link.channel", str(tmp_path / "missing"))
+def test_names_that_look_alike_are_locked_apart(tmp_path: Path) -> None:
+    with InstanceLock(f"{tmp_path}/a/b", "x"), InstanceLock(f"{tmp_path}/a-b", "x"):
+        pass
+
+
+def test_a_daemon_that_sees_other_folders_takes_the_same_lock(tmp_path: Path) -> None:
+    """The unit has a /tmp of its own and may not write /run/lock; a person who starts it by hand has neither bound."""
+    bus, private = str(tmp_path / "bus"), tmp_path / "private"
+    private.mkdir()
+    with held(bus, env={**os.environ, "TMPDIR": str(private)}), pytest.raises(ConfigError, match="in use by process"):
+        InstanceLock(bus, "link.channel")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="takes another user: run as root")
+def test_who_holds_the_lock_is_named_and_passed_over_only_when_an_operator_says_so(tmp_path: Path) -> None:
+    bus = str(tmp_path)
+
+    def hold(ready: Callable[[], None]) -> None:
+        with InstanceLock(bus, "link.channel"):
+            ready()
+            signal.pause()
+
+    with stranger(hold) as pid:
+        with pytest.raises(ConfigError, match=rf"process {pid} of user .*{STRANGER}"):
+            InstanceLock(bus, "link.channel")
+        with InstanceLock(bus, "link.channel", ignore=(STRANGER,)), pytest.raises(ConfigError, match="root"):
+            InstanceLock(bus, "link.channel", ignore=(STRANGER,))  # the second of ours is refused all the same
 
 
 def test_two_ways_to_write_one_socket_path_are_one_bus_and_namespaces_have_their_own(tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from rtctl.errors import LinkError, RequestError, UsageError
+from rtctl.trust import folder_owner, peer, trusted_users, user_name
 
 MESSAGE_MAX = 64 * 1024  # bytes, both ways
+SYSTEM = Path("/run/rtctl")  # RuntimeDirectory of the shipped unit: root makes it, for the user of the unit
 RETRY = 0.005  # [s] between two attempts when the daemon's queue of callers is full
 
 
@@ -23,7 +25,7 @@ def socket_folders() -> list[Path]:
     if runtime:
         folders.append(Path(runtime))
     folders.append(Path(f"/tmp/rtctl-{os.getuid()}"))
-    folders.append(Path("/run/rtctl"))  # RuntimeDirectory of the shipped unit
+    folders.append(SYSTEM)
     return folders
 
 
@@ -41,7 +43,8 @@ def find(robot: str = "") -> str:
     """
     pattern = f"rtctl-{robot}.sock" if robot else "rtctl-*.sock"
     places = [place for folder in socket_folders() for place in (folder, *_subfolders(folder))]
-    found = sorted({str(path) for place in places for path in place.glob(pattern) if path.is_socket()})
+    mine = [place for place in places if _listens_to_us(place)]
+    found = sorted({str(path) for place in mine for path in place.glob(pattern) if path.is_socket()})
     alive = [path for path in found if answers(path)]
     if len(alive) == 1:
         return alive[0]
@@ -49,6 +52,23 @@ def find(robot: str = "") -> str:
         looked = ", ".join(str(folder) for folder in socket_folders())
         raise LinkError(f"no daemon {'of ' + robot + ' ' if robot else ''}is running: no {pattern} answers in {looked}")
     raise UsageError(f"several daemons run: choose one by --socket PATH or --robot NAME: {', '.join(alive)}")
+
+
+def _listens_to_us(folder: Path) -> bool:
+    """Return whether only this user, root or the unit's own user can have put a socket into a folder."""
+    owner = folder_owner(folder / "any")
+    return owner in trusted_users() or (owner >= 0 and SYSTEM in (folder, *folder.parents))
+
+
+def _check_peer(link: socket.socket, path: str) -> None:
+    """Refuse a daemon that somebody else put where ours is looked for. Raises LinkError."""
+    pid, uid = peer(link)
+    if uid not in trusted_users() | {folder_owner(path)}:
+        link.close()
+        raise LinkError(
+            f"{path}: process {pid} of user {user_name(uid)} answers there, wanted one of "
+            f"{user_name(os.geteuid())}, root or the folder's owner"
+        )
 
 
 def answers(path: str) -> bool:
@@ -145,6 +165,7 @@ def _connect(path: str, timeout: float) -> socket.socket:
             link.close()
             raise LinkError(f"{path}: {error}") from None
         if code == 0:
+            _check_peer(link, path)
             link.settimeout(timeout)
             return link
         link.close()
@@ -156,4 +177,4 @@ def _connect(path: str, timeout: float) -> socket.socket:
 
 def _subfolders(folder: Path) -> list[Path]:
     """Return the folders of the unit's instances below /run/rtctl; elsewhere sockets lie flat."""
-    return [path for path in folder.glob("*") if path.is_dir()] if folder == Path("/run/rtctl") else []
+    return [path for path in folder.glob("*") if path.is_dir()] if folder == SYSTEM else []

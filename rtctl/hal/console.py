@@ -11,7 +11,6 @@ import os
 import select
 import socket
 import stat
-import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -20,10 +19,12 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from rtctl import trust
 from rtctl.errors import ConfigError, RequestError, RtctlError
 from rtctl.hal import messages
 from rtctl.hal.client import MESSAGE_MAX, answers
 from rtctl.hal.messages import Bounds, Notice
+from rtctl.trust import TrustError
 from rtctl.types import ObstacleEdit, Request
 
 PEERS_MAX = 8
@@ -136,8 +137,7 @@ class Console:
         except OSError:
             return
         link.setblocking(False)
-        credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-        _pid, uid, _gid = struct.unpack("3i", credentials)
+        _, uid = trust.peer(link)
         if uid not in self._admitted:
             self.counts["foreign_user"] += 1
             link.close()
@@ -306,16 +306,11 @@ def _check_folder(path: str) -> None:
     """Make the folder with mode 0750, or refuse one where strangers could replace the socket."""
     folder, label = os.path.dirname(os.path.abspath(path)), f"console.socket {path}"
     try:
-        with suppress(FileExistsError):
-            os.mkdir(folder, 0o750)
-        found = os.stat(folder)
+        trust.own_folder(folder)
     except OSError as error:
         raise ConfigError(label, f"folder {folder}: {error.strerror}", "a folder that exists or can be made") from None
-    if not stat.S_ISDIR(found.st_mode):
-        raise ConfigError(label, f"{folder}, which is no folder", "a folder")
-    if found.st_uid not in (0, os.geteuid()) or found.st_mode & 0o002:
-        got = f"folder {folder}, owned by user {found.st_uid}, mode {stat.S_IMODE(found.st_mode):04o}"
-        raise ConfigError(label, got, "a folder of this user or root that others cannot write to")
+    except TrustError as error:
+        raise ConfigError(label, str(error), "a folder of this user or root that others cannot write to") from None
 
 
 def _plain(value: Any) -> Any:

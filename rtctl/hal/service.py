@@ -1,17 +1,16 @@
 """What the daemon owes the machine it runs on: news for systemd, and one instance per bus."""
 
-import fcntl
+import errno
 import hashlib
 import os
 import socket
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from contextlib import suppress
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from rtctl.errors import ConfigError
+from rtctl.trust import peer, user_name
 
 KICKS_PER_WATCHDOG = 4  # a kick may be lost or late thrice before systemd acts
 
@@ -70,34 +69,36 @@ class Service:
 
 
 class InstanceLock:
-    """An flock: this process alone commands this bus. The kernel drops it with the process, even by SIGKILL."""
+    """This process alone commands this bus, whoever started it and whatever folders it sees.
 
-    def __init__(self, resource: str, label: str, folder: str | None = None) -> None:
+    The lock is a name in the kernel's table of Unix sockets, no file: nobody can replace or remove it, a private /tmp
+    does not hide it, and the kernel drops it with the process, even by SIGKILL. That table belongs to the network
+    namespace, as CAN interfaces do: containers that share a bus share the lock. The kernel tells who holds it.
+    """
+
+    def __init__(self, resource: str, label: str, ignore: Container[int] = ()) -> None:
         """Take the lock of `resource` at once or refuse; `label` names the setting in the refusal.
 
-        Raises ConfigError when another process holds it, naming that process.
+        ignore: user ids whose hold does not count, when an operator says so. Raises ConfigError when another process
+        holds it, naming process and user.
         """
-        self.path = Path(folder or _lock_folder()) / f"rtctl-{_file_name(resource)}.lock"
-        self._fd = _open_lock(self.path, label)
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            holder = os.pread(self._fd, 32, 0).decode(errors="replace").strip() or "unknown"
-            os.close(self._fd)
-            raise ConfigError(label, f"{resource!r}, in use by process {holder}", "one rtctl per bus") from None
-        self._note(f"{os.getpid()}\n")
+        name = "\0rtctl/" + hashlib.sha256(resource.encode()).hexdigest()[:32]
+        self._socket: socket.socket | None = None
+        for attempt in (name, name + "/again"):
+            self._socket = _bound(attempt)
+            if self._socket is not None:
+                return
+            pid, uid = _holder(attempt)
+            if uid not in ignore:
+                break
+        who = "a process that has just ended: try again" if pid < 0 else f"process {pid} of user {user_name(uid)}"
+        raise ConfigError(label, f"{resource!r}, in use by {who}", "one rtctl per bus")
 
     def close(self) -> None:
-        """Give the bus up. The file stays: removing it would let two processes lock two files of one name."""
-        if self._fd >= 0:
-            self._note("")
-            os.close(self._fd)
-            self._fd = -1
-
-    def _note(self, text: str) -> None:
-        with suppress(OSError):  # another user's file, opened for reading: the lock counts, the note is a courtesy
-            os.ftruncate(self._fd, 0)
-            os.pwrite(self._fd, text.encode(), 0)
+        """Give the bus up."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def __enter__(self) -> Self:
         return self
@@ -106,6 +107,32 @@ class InstanceLock:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _bound(name: str) -> socket.socket | None:
+    """Return a listening socket of that name, None when another has it."""
+    lock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+    try:
+        lock.bind(name)
+        lock.listen(1)
+    except OSError as error:
+        lock.close()
+        if error.errno == errno.EADDRINUSE:
+            return None
+        raise
+    return lock
+
+
+def _holder(name: str) -> tuple[int, int]:
+    """Return process id and user id of who listens at a name, -1 and -1 when nobody does any more."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as link:
+        try:
+            link.connect(name)
+        except BlockingIOError:
+            return 0, -2  # its queue of callers is full: somebody holds it
+        except OSError:
+            return -1, -1
+        return peer(link)
 
 
 def bus_resource(interface: str, channel: str) -> str:
@@ -117,27 +144,6 @@ def bus_resource(interface: str, channel: str) -> str:
         return f"socketpair:{os.path.realpath(channel)}" if "/" in channel else f"socketpair:{channel}"
     namespace = os.stat("/proc/self/ns/net").st_ino
     return f"{interface}:{channel}@{namespace}"
-
-
-def _open_lock(path: Path, label: str) -> int:
-    """Open the lock file, whoever made it: an flock needs no right to write."""
-    common = os.O_CLOEXEC | os.O_NOFOLLOW
-    # O_CREAT comes last: in a sticky folder the kernel refuses it on another user's file, even to root
-    for flags in (os.O_RDWR, os.O_RDONLY, os.O_RDWR | os.O_CREAT):
-        try:
-            return os.open(path, flags | common, 0o644)
-        except OSError as error:
-            reason = error.strerror
-    raise ConfigError(label, f"{path}: {reason}", "a lock file this user may open")
-
-
-def _lock_folder() -> str:
-    return "/run/lock" if os.access("/run/lock", os.W_OK) else tempfile.gettempdir()
-
-
-def _file_name(resource: str) -> str:
-    readable = "".join(c if c.isalnum() else "-" for c in resource)[-40:].strip("-")
-    return f"{readable}-{hashlib.sha256(resource.encode()).hexdigest()[:12]}"  # the hash keeps look-alikes apart
 
 
 def _address(text: str) -> str:

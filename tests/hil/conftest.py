@@ -23,9 +23,9 @@ from tools import vcan
 GUEST = Path(__file__).resolve().parent / "guest"
 ROOT = GUEST.parent.parent.parent
 WARM = """
-from rtctl import config
-from rtctl.control import pipe
-pipe.warm(config.build(config.load("configs/panda.toml"), "configs/panda.toml"))
+from rtctl import design
+from rtctl.arm import pipe
+pipe.warm(design.build(design.load("configs/panda.toml"), "configs/panda.toml"))
 """
 REPORTS = "RTCTL_VCAN_REPORTS"  # file that the pytest beside vcan0 appends to
 TIMEOUT = 1500.0  # [s] for all of them together

@@ -30,12 +30,15 @@ from rtctl.log.read.reader import read, segments
 from rtctl.log.record import ring as rings
 from rtctl.log.record.ring import Consumer, Producer, attach, create
 from rtctl.log.record.writer import Options, Session, segment_path
+from rtctl.trust import TrustError, plain_name
 
 CAPACITY = 32 << 20  # [bytes]: some 8 s of a 7-joint arm at 1 kHz
 PREFIX = "rtctl-"
 SUFFIX = ".ring"
 NAP = 0.02  # [s] between looks at the ring
 READY_TIMEOUT = 20.0  # [s]
+LONGEST = 7 * 86400.0  # [s] of a segment
+LARGEST = 10**13  # [bytes] of a segment and of the free disk that is kept, as a config may say
 
 
 class Stats(NamedTuple):
@@ -155,9 +158,21 @@ class Recorder:
         self._ring.unmap()
 
 
-def _options(values: list[str]) -> Options:
-    directory, stem, segment_s, segment_bytes, floor_bytes = values
-    return Options(Path(directory), stem, float(segment_s), int(segment_bytes), int(floor_bytes))
+def _options(blob: bytes) -> Options:
+    """Return what a ring says of its log, with nothing in it that names another folder or breaks a bound.
+
+    Raises LinkError: a ring that another program wrote, or an older one of ours, is no reason to fail.
+    """
+    try:
+        directory, stem, segment_s, segment_bytes, floor_bytes = json.loads(blob)["options"]
+        options = Options(Path(directory), plain_name(stem), float(segment_s), int(segment_bytes), int(floor_bytes))
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError, TrustError) as error:
+        raise LinkError(f"a ring whose header is not understood: {error}") from None
+    sizes = 0 < options.segment_bytes <= LARGEST and 0 <= options.floor_bytes <= LARGEST
+    sane = sizes and 0.0 < options.segment_s <= LONGEST
+    if not sane or not options.directory.is_absolute():
+        raise LinkError(f"a ring with options out of their bounds: {options}")
+    return options
 
 
 def _predecessor(options: Options) -> tuple[int, int]:
@@ -198,8 +213,8 @@ class _Drain:
 
     def __init__(self, ring: Consumer) -> None:
         self.ring = ring
+        options = _options(ring.blob)
         content = json.loads(ring.blob)
-        options = _options(content["options"])
         number, first = _predecessor(options)
         self.skip = max(number, ring.words[rings.CONSUMED])
         self.session = Session(header_from_json(content["header"]), options, self.skip, first)
@@ -308,7 +323,7 @@ def rescue(directory: Path | str, folders: Sequence[Path] = ()) -> list[Path]:
     before = set(directory.glob("*.mcap"))
     for folder in folders or (rings.SHM, Path(tempfile.gettempdir())):
         for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
-            with contextlib.suppress(LinkError, OSError, ValueError, KeyError):
+            with contextlib.suppress(LinkError, LogError, TrustError, OSError):
                 if _orphan(path, directory):
                     drain(path)
     recover_folder(directory)
@@ -316,10 +331,10 @@ def rescue(directory: Path | str, folders: Sequence[Path] = ()) -> list[Path]:
 
 
 def _orphan(path: Path, directory: Path) -> bool:
+    """Return whether a ring is of a log in `directory` and its producer is gone; raises as `drain` does."""
     ring = attach(path)
     try:
-        mine = _options(json.loads(ring.blob)["options"]).directory == directory
-        return mine and not ring.producer_alive()
+        return _options(ring.blob).directory == directory and not ring.producer_alive()
     finally:
         ring.unmap()
 
@@ -339,7 +354,7 @@ def main(arguments: Sequence[str]) -> int:
     _detach()
     try:
         return 0 if drain(Path(arguments[0])) else 1
-    except (LinkError, LogError, OSError) as error:
+    except (LinkError, LogError, TrustError, OSError) as error:
         print(f"rtctl recorder: {error}", file=sys.stderr)
         return 1
 

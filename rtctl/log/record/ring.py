@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 from rtctl.errors import LinkError
 from rtctl.log.entry import Batch, Payload, empty, stream
+from rtctl.trust import open_file
 
 MAGIC = 0x31474E5254435452  # "RTCTRNG1"
 PAGE = 4096
@@ -105,7 +106,7 @@ class Ring:
         self.data_at = self.words[DATA]
         power = self.capacity > 0 and self.capacity & (self.capacity - 1) == 0
         if self.words[MAGIC_AT] != MAGIC or not power or self.data_at + self.capacity + SLACK != size:
-            self.unmap()
+            self.release_views()
             raise LinkError(f"{path}: not a ring of this version")
         self.mask = self.capacity - 1
         self._fence = _fence()
@@ -136,12 +137,16 @@ class Ring:
         start = process_start(self.words[PRODUCER])
         return start != 0 and start == self.words[PRODUCER_START]
 
-    def unmap(self) -> None:
-        """Give the memory back; the file stays."""
+    def release_views(self) -> None:
+        """Give the memory back; the descriptor stays open."""
         self.words.release()
         self._page.release()
         with contextlib.suppress(BufferError):  # somebody still holds a payload; it goes with the last of them
             self.map.close()
+
+    def unmap(self) -> None:
+        """Give memory and descriptor back; the file stays."""
+        self.release_views()
         os.close(self.file)
 
 
@@ -328,8 +333,13 @@ def _initialised(path: Path, file: int, capacity: int, data_at: int, blob: bytes
 
 
 def attach(path: Path) -> Consumer:
-    """Open an existing ring for taking.
+    """Open an existing ring of this user's for taking.
 
-    Raises LinkError when it is not a ring, OSError when it cannot be opened.
+    Raises LinkError when it is not a ring, TrustError when another user made it, OSError when it cannot be opened.
     """
-    return Consumer(path, os.open(path, os.O_RDWR | os.O_CLOEXEC))
+    file = open_file(path, os.O_RDWR, (os.geteuid(),), private=True)
+    try:
+        return Consumer(path, file)
+    except LinkError:
+        os.close(file)
+        raise
