@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.arm.progress import Progress, arrived, at_rest, idle, refusal, time_left
+from rtctl.arm.progress import Progress, arrived, at_rest, idle, time_left
+from rtctl.control.goals import refusal
 from rtctl.types import Goal, Task
 
 FAR = np.full(3, np.inf)

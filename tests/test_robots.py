@@ -185,7 +185,7 @@ def test_check_has_no_more_to_say_than_that_a_simulation_is_not_real_time(name: 
 
 def test_the_damiao_drives_have_their_makers_scales_on_both_ends_of_the_wire():
     wanted = [(12.5, 45.0, 54.0)] * 2 + [(12.5, 8.0, 28.0)] * 2 + [(12.5, 30.0, 10.0)] * 3
-    assert [tuple(s) for s in cfg.rules.scales(cfg.load(config_of("openarm")))] == wanted
+    assert [tuple(s) for s in cfg.scales(cfg.load(config_of("openarm")))] == wanted
     assert [tuple(r.scale) for r in load_settings(config_of("openarm")).ratings] == wanted
 
 
