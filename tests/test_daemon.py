@@ -213,7 +213,8 @@ def test_a_killed_controller_leaves_a_whole_log_and_its_successor_comes_up_idle(
 def test_a_tick_that_raises_ends_in_a_damped_stop_with_the_drives_disabled(tmp_path: Path) -> None:
     script = """
 import sys, time, traceback
-from rtctl import cli, servo
+from rtctl import cli
+from rtctl.app import servo
 told = traceback.TracebackException.__init__
 def slowly(*args, **options):
     time.sleep(1.5)  # sources on a slow disk: longer than the drives wait
