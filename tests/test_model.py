@@ -128,7 +128,7 @@ def test_points_are_carried_by_their_link_alone(body: RigidBody) -> None:
     q, qd, _ = states(body, 1)[0]
     before = body.evaluate(q, qd, points)
     last = np.zeros(body.n)
-    leaf = int(np.argmax(body.chain.sum(axis=1))) - 1  # the joint at the end of the chain
+    leaf = int(np.argmax(body.skeleton.chain.sum(axis=1))) - 1  # the joint at the end of the chain
     last[leaf] = 0.3
     after = body.evaluate(q + last, qd, points)
     moved = np.abs(after.P - before.P).max(axis=1) > 1e-9

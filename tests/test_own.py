@@ -57,6 +57,27 @@ def test_distances_are_those_of_the_meshes() -> None:
     assert checked > 500
 
 
+@pytest.mark.parametrize("reach", [0.01, REACH, 0.2])
+def test_a_pair_is_left_out_only_where_gjk_finds_it_beyond_reach(reach: float) -> None:
+    every = Own(own().hulls, own().pairs, reach)
+    asked = within = 0
+    for q in postures(400, seed=7):
+        R, t = panda().placements(q)
+        at = [coal.Transform3s(R[h.link], t[h.link]) for h in every.hulls]
+        true = np.array(
+            [
+                coal.distance(
+                    every.hulls[i].shape, at[i], every.hulls[j].shape, at[j], coal.DistanceRequest(),
+                    coal.DistanceResult(),
+                )
+                for i, j in every.pairs
+            ]
+        )  # fmt: skip
+        assert (every.distances(R, t) == np.where(true < reach, true, np.inf)).all()
+        asked, within = asked + len(every.near(R, t)), within + int((true < reach).sum())
+    assert 10 < within <= asked < 1.2 * within  # and few are measured for nothing
+
+
 def test_slopes_are_those_of_finite_differences() -> None:
     h, checked, bad = 1e-6, 0, 0
     for q in postures(500, seed=1):

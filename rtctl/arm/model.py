@@ -1,7 +1,7 @@
 """The parameter-evaluation level: rigid-body dynamics and kinematics of one arm from its URDF (Pinocchio).
 
-`RigidBody.evaluate` runs at the model rate. It takes Pinocchio's results through views held from the start and one
-compiled kernel turns them into a `Model`: fresh arrays, no BLAS, equal bits for equal inputs.
+`RigidBody.evaluate` runs at the model rate. It takes Pinocchio's results through views of its memory held from the
+start, and one compiled kernel turns them into a `Model`: fresh arrays, no BLAS, equal bits for equal inputs.
 """
 
 from collections.abc import Sequence
@@ -108,10 +108,12 @@ def _point_jacobians(Jw: F64, iv: I64, chain: B1, link: I64, P: F64, Jp: F64) ->
 
 
 @kernel
-def _quadratic(J: F64, A_inv: F64, used: int, out: F64) -> None:
-    """Write J A^-1 J^T, symmetric to the bit, to out (d, d); columns of J (d, n) from `used` on are zero."""
+def _quadratic(J: F64, A_inv: F64, used: int, row: F64, out: F64) -> None:
+    """Write J A^-1 J^T, symmetric to the bit, to out (d, d); columns of J (d, n) from `used` on are zero.
+
+    row (n,): scratch.
+    """
     d = J.shape[0]
-    row = np.empty(used)
     for r in range(d):
         for k in range(used):
             row[k] = 0.0
@@ -163,40 +165,78 @@ def _tip(Jw: F64, dJw: F64, iv: I64, chain: B1, tip: int, x: F64, qd: F64) -> tu
     return J, Jdqd
 
 
+class Terms(NamedTuple):
+    """Pinocchio's results, as views of its own memory: what it computes next stands in them."""
+
+    M: F64  # (nv, nv) joint-space inertia
+    nle: F64  # (nv,) Coriolis, centrifugal and gravity torque
+    g: F64  # (nv,) gravity torque
+    J: F64  # (6, nv) joint twists at the world origin
+    dJ: F64  # (6, nv) their time derivative
+    R: F64  # (joints, 3, 3) placements
+    t: F64  # (joints, 3) [m]
+
+
+class Skeleton(NamedTuple):
+    """How the configured joints and links lie in Pinocchio's arrays; link 0 is the base, i what joint i-1 carries."""
+
+    iv: I64  # (n,) index of each joint's velocity
+    joint: I64  # (n + 1,) Pinocchio's joint that carries each link
+    chain: B1  # (n + 1, n) [link, joint]: the joint moves the link
+    tip: int  # link of the tip
+    tip_R: F64  # (3, 3) the tip's frame in that link
+    tip_t: F64  # (3,) [m]
+
+
+@kernel
+def _placements(R: F64, t: F64, joint: I64) -> tuple[F64, F64]:
+    """Return the links' placements (n + 1, 3, 3), (n + 1, 3) [m]."""
+    Rj, tj = np.empty((joint.shape[0], 3, 3)), np.empty((joint.shape[0], 3))
+    for k in range(joint.shape[0]):
+        for i in range(3):
+            tj[k, i] = t[joint[k], i]
+            for j in range(3):
+                Rj[k, i, j] = R[joint[k], i, j]
+    return Rj, tj
+
+
 @kernel
 def _assemble(
-    M: F64, nle: F64, gravity: F64, Jw: F64, dJw: F64, Rj: F64, tj: F64, qd: F64,
-    iv: I64, chain: B1, tip: int, tip_R: F64, tip_t: F64,
-    link: I64, local: F64,
-) -> tuple[F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64]:  # fmt: skip
-    """Return every array of a `Model` after q and qd, in order, from Pinocchio's data at one configuration."""
+    terms: Terms, arm: Skeleton, qd: F64, link: I64, local: F64
+) -> tuple[F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64, F64]:
+    """Return every array of a `Model` after q and qd and up to the pairs, in order; then the links' placements."""
+    iv, chain, tip = arm.iv, arm.chain, arm.tip
     n, m = iv.shape[0], link.shape[0]
     A = np.empty((n, n))
     h = np.empty(n)
     g = np.empty(n)
     for i in range(n):
-        g[i] = gravity[iv[i]]
-        h[i] = nle[iv[i]] - g[i]
+        g[i] = terms.g[iv[i]]
+        h[i] = terms.nle[iv[i]] - g[i]
         for j in range(n):
-            A[i, j] = M[iv[i], iv[j]]
+            A[i, j] = terms.M[iv[i], iv[j]]
     A_inv = spd_inverse(A)
+    Rj, tj = _placements(terms.R, terms.t, arm.joint)
     x = np.empty(3)
     R = np.empty((3, 3))
     for i in range(3):
-        x[i] = tj[tip, i] + Rj[tip, i, 0] * tip_t[0] + Rj[tip, i, 1] * tip_t[1] + Rj[tip, i, 2] * tip_t[2]
+        x[i] = tj[tip, i] + Rj[tip, i, 0] * arm.tip_t[0] + Rj[tip, i, 1] * arm.tip_t[1] + Rj[tip, i, 2] * arm.tip_t[2]
         for j in range(3):
-            R[i, j] = Rj[tip, i, 0] * tip_R[0, j] + Rj[tip, i, 1] * tip_R[1, j] + Rj[tip, i, 2] * tip_R[2, j]
-    J, Jdqd = _tip(Jw, dJw, iv, chain, tip, x, qd)
+            R[i, j] = (
+                Rj[tip, i, 0] * arm.tip_R[0, j] + Rj[tip, i, 1] * arm.tip_R[1, j] + Rj[tip, i, 2] * arm.tip_R[2, j]
+            )
+    J, Jdqd = _tip(terms.J, terms.dJ, iv, chain, tip, x, qd)
     Lambda_inv = np.empty((6, 6))
-    _quadratic(J, A_inv, n, Lambda_inv)
+    row = np.empty(n)
+    _quadratic(J, A_inv, n, row, Lambda_inv)
     P = np.empty((m, 3))
     _place_points(Rj, tj, link, local, P)
     Jp = np.zeros((m, 3, n))
-    _point_jacobians(Jw, iv, chain, link, P, Jp)
+    _point_jacobians(terms.J, iv, chain, link, P, Jp)
     B = np.empty((m, 3, 3))
     for i in range(m):
-        _quadratic(Jp[i], A_inv, _used(chain, link[i]), B[i])
-    return A, A_inv, h, g, x, R, J, Jdqd, P, Jp, B, Lambda_inv
+        _quadratic(Jp[i], A_inv, _used(chain, link[i]), row, B[i])
+    return A, A_inv, h, g, x, R, J, Jdqd, P, Jp, B, Lambda_inv, Rj, tj
 
 
 @kernel
@@ -231,27 +271,24 @@ class RigidBody:
         # parent[link], link numbering; every other joint was locked, so a parent is the base or a configured joint
         link_of = {0: 0} | {joint: k + 1 for k, joint in enumerate(joints)}
         self.parent: I64 = np.array([0] + [link_of[model.parents[j]] for j in joints], dtype=np.int64)
-        self.chain: B1 = np.zeros((n + 1, n), dtype=np.bool_)  # [link, joint]: the joint moves the link
+        self.link_of = link_of  # Pinocchio's joint id -> link
+        chain: B1 = np.zeros((n + 1, n), dtype=np.bool_)
         for k in range(1, n + 1):
             ancestor = k
             while ancestor:
-                self.chain[k, ancestor - 1] = True
+                chain[k, ancestor - 1] = True
                 ancestor = int(self.parent[ancestor])
-        self.link_of = link_of  # Pinocchio's joint id -> link
         frame = model.frames[model.getFrameId(tip_frame)]
-        self.tip_link = link_of[frame.parentJoint]
-        self._tip_R: F64 = np.ascontiguousarray(frame.placement.rotation)
-        self._tip_t: F64 = np.ascontiguousarray(frame.placement.translation)
-        self._bind(joints)
-
-    def _bind(self, joints: list[int]) -> None:
-        """Hold views of Pinocchio's results: fetching them anew costs more than the arithmetic."""
+        self.skeleton = Skeleton(
+            iv=self._iv,
+            joint=np.array([0, *joints], dtype=np.int64),
+            chain=chain,
+            tip=link_of[frame.parentJoint],
+            tip_R=np.ascontiguousarray(frame.placement.rotation),
+            tip_t=np.ascontiguousarray(frame.placement.translation),
+        )
         data = self.data
-        self._terms = (data.M, data.nle, data.g, data.J, data.dJ)
-        placements = [data.oMi[j] for j in [0, *joints]]
-        self._views = [(k, oMi.rotation, oMi.translation) for k, oMi in enumerate(placements)]
-        self._Rj, self._tj = np.zeros((len(placements), 3, 3)), np.zeros((len(placements), 3))
-        self._Rj[0] = np.eye(3)
+        self._terms = Terms(data.M, data.nle, data.g, data.J, data.dJ, *_held(data.oMi))
 
     @property
     def n(self) -> int:
@@ -325,32 +362,43 @@ class RigidBody:
         q, qd: (n,) [rad, rad/s]. The result shares no memory with this object.
         """
         pin.computeAllTerms(self.model, self.data, self.configuration(q), self._velocity(qd))
-        Rj, tj = self._Rj, self._tj
-        for k, R, t in self._views:
-            Rj[k], tj[k] = R, t
-        M, nle, gravity, Jw, dJw = self._terms
-        terms = _assemble(
-            M, nle, gravity, Jw, dJw, Rj, tj, qd, self._iv, self.chain, self.tip_link, self._tip_R, self._tip_t,
-            points.link, points.local,
-        )  # fmt: skip
-        rho, rows = own.measure(Rj, tj, Jw, self._iv, self.chain) if own else (np.zeros(0), np.zeros((0, self.n)))
+        *terms, Rj, tj = _assemble(self._terms, self.skeleton, qd, points.link, points.local)
+        rho, rows = np.zeros(0), np.zeros((0, self.n))
+        if own:
+            rho, rows = own.measure(Rj, tj, self._terms.J, self.skeleton.iv, self.skeleton.chain)
         return Model(q.copy(), qd.copy(), *terms, rho, rows)
+
+    def placements(self, q: F64) -> tuple[F64, F64]:
+        """Return the links' placements (n + 1, 3, 3), (n + 1, 3) [m] at q (n,)."""
+        pin.forwardKinematics(self.model, self.data, self.configuration(q))
+        return _placements(self._terms.R, self._terms.t, self.skeleton.joint)
 
     def placed(self, q: F64, points: Points) -> F64:
         """Return the PSPs (m, 3) [m] at q (n,), and nothing else: a planner asks thousands of times."""
-        pin.forwardKinematics(self.model, self.data, self.configuration(q))
-        for k, R, t in self._views:
-            self._Rj[k], self._tj[k] = R, t
         P = np.empty((len(points.link), 3))
-        _place_points(self._Rj, self._tj, points.link, points.local, P)
+        _place_points(*self.placements(q), points.link, points.local, P)
         return P
 
     def own_distances(self, q: F64, own: Own) -> F64:
         """Return the distances (L,) [m] of the watched pairs at q (n,), inf beyond `own.reach`."""
-        pin.computeJointJacobians(self.model, self.data, self.configuration(q))
-        for k, R, t in self._views:
-            self._Rj[k], self._tj[k] = R, t
-        return own.measure(self._Rj, self._tj, self._terms[3], self._iv, self.chain)[0]
+        return own.distances(*self.placements(q))
+
+
+def _held(placements: Any) -> tuple[F64, F64]:
+    """Return views of all rotations (joints, 3, 3) and translations (joints, 3) [m] of a vector of Pinocchio's SE3.
+
+    They follow each other in memory at equal steps, so that one view each serves instead of two a joint.
+    """
+    views = [(X.rotation, X.translation) for X in placements]
+    at = np.array([[view.__array_interface__["data"][0] for view in pair] for pair in views], dtype=np.int64)
+    step = int(at[1, 0] - at[0, 0])
+    if (np.diff(at, axis=0) != step).any():
+        raise RuntimeError("Pinocchio's placements are not one array")
+    R, t = views[0]
+    return (
+        np.lib.stride_tricks.as_strided(R, (len(views), 3, 3), (step, *R.strides)),
+        np.lib.stride_tricks.as_strided(t, (len(views), 3), (step, *t.strides)),
+    )
 
 
 def _check_names(place: str, model: Any, joint_names: Sequence[str], tip_frame: str) -> None:

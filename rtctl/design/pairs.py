@@ -31,7 +31,7 @@ def _hull(link: int, name: str, corners: F64) -> Hull:
     mesh.buildConvexHull(True, "Qt")
     centre = 0.5 * (corners.min(0) + corners.max(0))
     radius = float(np.sqrt(((corners - centre) ** 2).sum(1)).max())
-    return Hull(link, name, mesh.convex, centre, radius)
+    return Hull(link, name, mesh.convex, corners, centre, radius)
 
 
 def watched(body: RigidBody, q_min: F64, q_max: F64, q_home: F64, influence: float, reach: float) -> Own:
@@ -53,7 +53,8 @@ def watched(body: RigidBody, q_min: F64, q_max: F64, q_home: F64, influence: flo
     samples = np.random.default_rng(0).uniform(q_min, q_max, (POSTURES, body.n))
     meets = np.zeros(len(pairs), np.bool_)
     for q in samples:
-        meets |= body.own_distances(q, every) < SAFE
+        open_ = np.flatnonzero(~meets)  # what has met once need not be measured again
+        meets[open_] = body.own_distances(q, Own(hulls, every.pairs[open_], SAFE)) < SAFE
     at_home = body.own_distances(q_home, home)
     elbow = np.array([body.parent[body.parent[hulls[i].link]] == hulls[j].link for i, j in pairs])
     keep = meets & ~(at_home < influence) & ~(elbow & (at_home < CROOK))
