@@ -62,6 +62,46 @@ def measure(kf: KalmanFilter, z: float, h: tuple[float, float], r: float) -> flo
     return float(kf.y[0, 0] / np.sqrt(kf.S[0, 0]))
 
 
+def steady(sigma: float, r_v: float, r_x: float, ratio: int, age: float, has_velocity: bool) -> tuple[F64, F64, F64]:
+    """Return covariance and gains of filterpy's filter once a cycle of updates leaves them as they were."""
+    kf = axis_filter(0.0, 0.0, np.diag([r_x * r_x, r_v * r_v]))
+    gain_velocity = np.zeros(2)
+    for _ in range(20_000):
+        before = kf.P.copy()
+        for _ in range(ratio):
+            step(kf, 0.0, DT, sigma)
+            if has_velocity:
+                measure(kf, 0.0, (0.0, 1.0), r_v)
+                gain_velocity = kf.K[:, 0].copy()
+        measure(kf, 0.0, (1.0, -age), r_x)
+        if np.allclose(kf.P, before, rtol=1e-10, atol=0.0):
+            break
+    return kf.P, gain_velocity, kf.K[:, 0]
+
+
+@pytest.mark.parametrize("age", [0.0, 2e-3])
+def test_the_tips_steady_state_is_filterpys(age: float) -> None:
+    d, p = design(PARAMS, DT, RATIO, age), PARAMS
+    for mine, theirs in zip(
+        (d.P, d.gain_velocity, d.gain_pose), steady(p.sigma_a, p.r_v, p.r_x, RATIO, age, True), strict=True
+    ):
+        assert_allclose(mine, theirs, rtol=1e-8)
+    for mine, theirs in zip(
+        (d.P_rot, d.gain_velocity_rot, d.gain_pose_rot),
+        steady(p.sigma_alpha, p.r_omega, p.r_rot, RATIO, age, True),
+        strict=True,
+    ):
+        assert_allclose(mine, theirs, rtol=1e-8)
+    assert (Q_discrete_white_noise(2, DT, p.sigma_a**2) == d.Q).all()
+
+
+@pytest.mark.parametrize("has_qd", [True, False])
+def test_a_joints_steady_covariance_is_filterpys(has_qd: bool) -> None:
+    p = joint_params(1, has_qd)
+    P, _, _ = steady(p.sigma_qdd[0], p.r_qd[0], p.r_q[0], 1, DT, has_qd)
+    assert_allclose(design_joint(p, DT, DT)[0], P, rtol=1e-8)
+
+
 def test_each_axis_of_the_tip_is_filterpys_filter_step_by_step() -> None:
     rng = np.random.default_rng(0)
     P = np.array([[1e-4, 2e-5], [2e-5, 1e-2]])

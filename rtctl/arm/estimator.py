@@ -2,8 +2,8 @@
 
 Every axis is the unit mass that the law's decoupling promises: state (x, xd), input the commanded acceleration F*,
 process noise what the model does not know of it, held constant over a step. One 2 x 2 covariance serves all axes
-that share their noise. filterpy designs the filters (`design`, `design_joint`) and is the oracle of the compiled
-form in the tests. Pure: an estimate goes in and a new one comes out; a NaN goes through and is the caller's to find.
+that share their noise. Their steady states are found when a robot is designed; filterpy is the oracle of both in
+the tests. Pure: an estimate goes in and a new one comes out; a NaN goes through and is the caller's to find.
 """
 
 import math
@@ -40,7 +40,7 @@ class TipEstimate(NamedTuple):
 
 
 class Design(NamedTuple):
-    """The tip filter in its steady state, as filterpy finds it; gains act on (x, xd) or (rotation, omega)."""
+    """The tip filter in its steady state; gains act on (x, xd) or (rotation, omega)."""
 
     Q: F64  # (2, 2) process noise of one step
     Q_rot: F64  # (2, 2)

@@ -4,8 +4,12 @@ import math
 
 import numpy as np
 
-from rtctl.arm.estimator import Design, EstimatorParams, JointParams
+from rtctl.arm.estimator import Design, EstimatorParams, JointParams, _correct, _propagate
+from rtctl.kernel import kernel
 from rtctl.types import F64
+
+CYCLES = 20_000  # at most; a servo's filters repeat within some hundreds
+UNCHANGED = 1e-10  # relative change of a covariance in one cycle that counts as none
 
 
 def tip_params(J: F64, P: F64, sigma_a: float, sigma_alpha: float) -> EstimatorParams:
@@ -20,7 +24,7 @@ def tip_params(J: F64, P: F64, sigma_a: float, sigma_alpha: float) -> EstimatorP
 
 
 def design(params: EstimatorParams, dt: float, ratio: int, age: float) -> Design:
-    """Return the tip filter's steady state, found by running filterpy's filter until it repeats.
+    """Return the tip filter's steady state, found by running the filter until it repeats.
 
     dt [s]: servo period, a velocity update each. ratio: servo periods per pose update. age [s] of a pose.
     """
@@ -32,7 +36,7 @@ def design(params: EstimatorParams, dt: float, ratio: int, age: float) -> Design
 
 
 def design_joint(params: JointParams, dt: float, age: float) -> F64:
-    """Return the joint filters' steady covariance (n, 2, 2), found by running filterpy's filter until it repeats.
+    """Return the joint filters' steady covariance (n, 2, 2), found by running the filter until it repeats.
 
     dt [s]: servo period. age [s] of a reply when it is used: one period.
     """
@@ -44,29 +48,30 @@ def _steady(
     sigma: float, r_v: float, r_x: float, dt: float, ratio: int, age: float, has_velocity: bool
 ) -> tuple[F64, F64, F64, F64]:
     """Return Q, P and the two gains of one axis once a cycle of updates leaves its covariance as it was."""
-    # Imported here: it takes a second, and only a build needs it.
-    from filterpy.common import Q_discrete_white_noise
-    from filterpy.kalman import KalmanFilter
+    Q = np.array([[0.25 * dt**4, 0.5 * dt**3], [0.5 * dt**3, dt**2]]) * (sigma * sigma)
+    P, gain_velocity, gain_pose = _repeat(sigma, r_v, r_x, dt, ratio, age, has_velocity)
+    # Rounded: what remains of the first cycles must not tell by which path the steady state was reached.
+    return Q, _round(P), _round(gain_velocity), _round(gain_pose)
 
-    axis = KalmanFilter(dim_x=2, dim_z=1)
-    axis.F = np.array([[1.0, dt], [0.0, 1.0]])
-    axis.Q = Q_discrete_white_noise(2, dt, sigma * sigma)
-    axis.P = np.diag([r_x * r_x, r_v * r_v])
-    gain_velocity = np.zeros(2)
-    for _ in range(20_000):
-        before = axis.P.copy()
-        for k in range(ratio):
-            axis.predict()
+
+@kernel
+def _repeat(
+    sigma: float, r_v: float, r_x: float, dt: float, ratio: int, age: float, has_velocity: bool
+) -> tuple[F64, F64, F64]:
+    """Return covariance (2, 2) and gains (2,), (2,) after cycles of `ratio` steps that change it no more."""
+    P = np.zeros((2, 2))
+    P[0, 0], P[1, 1] = r_x * r_x, r_v * r_v
+    gain_velocity, gain_pose = np.zeros(2), np.zeros(2)
+    for _ in range(CYCLES):
+        before = P
+        for _ in range(ratio):
+            P = _propagate(P, dt, sigma)
             if has_velocity:
-                axis.update(0.0, R=r_v * r_v, H=np.array([[0.0, 1.0]]))
-                gain_velocity = axis.K[:, 0].copy()
-            if k == ratio - 1:
-                axis.update(0.0, R=r_x * r_x, H=np.array([[1.0, -age]]))
-                gain_pose = axis.K[:, 0].copy()
-        if np.allclose(axis.P, before, rtol=1e-10, atol=0.0):
+                _, gain_velocity[0], gain_velocity[1], P = _correct(P, 0.0, 1.0, r_v)
+        _, gain_pose[0], gain_pose[1], P = _correct(P, 1.0, -age, r_x)
+        if np.all(np.abs(P - before) <= UNCHANGED * np.abs(before)):
             break
-    # Rounded: filterpy's BLAS differs in the last bits from one processor to another, an estimate must not.
-    return axis.Q, _round(axis.P), _round(gain_velocity), _round(gain_pose)
+    return P, gain_velocity, gain_pose
 
 
 def _round(values: F64) -> F64:
