@@ -3,8 +3,9 @@
 Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
 """
 
+from collections.abc import Sequence
 from enum import STRICT, IntEnum, IntFlag
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,16 +194,54 @@ class Command(NamedTuple):
     tau: F64  # (n,) [Nm]
 
 
+class Frames(Sequence[bytes]):
+    """Raw CAN frames of one size in one piece of memory: a cycle's, taken apart only where something is odd."""
+
+    __slots__ = ("data", "size")
+
+    def __init__(self, data: bytes, size: int) -> None:
+        """`data`: one frame behind the other, each of `size` bytes."""
+        self.data, self.size = data, size
+
+    @classmethod
+    def of(cls, frames: Sequence[bytes]) -> "Frames | None":
+        """Return frames in one piece; None unless there are some and all have one size."""
+        if isinstance(frames, Frames):
+            return frames
+        sizes = set(map(len, frames))
+        return cls(b"".join(frames), sizes.pop()) if len(sizes) == 1 and 0 not in sizes else None
+
+    def __len__(self) -> int:
+        return len(self.data) // self.size
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[bytes]: ...
+
+    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
+        at = range(0, len(self.data), self.size)[index]
+        if isinstance(at, int):
+            return self.data[at : at + self.size]
+        return [self.data[each : each + self.size] for each in at]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment] # equal to a list, which has none
+
+
 class Transport(Protocol):
     """Moves raw `struct can_frame` (16 bytes) and `struct canfd_frame` (72 bytes); blocks only in wait and collect."""
 
     def send(self, raw: bytes) -> bool: ...  # False: dropped, never queued
 
-    def send_all(self, frames: list[bytes]) -> list[bytes]: ...  # a cycle's frames at once; those that went out
+    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]: ...  # a cycle's at once; those that went out
 
-    def receive(self) -> list[bytes]: ...  # everything that waits
+    def receive(self) -> Sequence[bytes]: ...  # everything that waits
 
-    def collect(self, count: int, timeout: float) -> list[bytes]: ...  # waits for that many, or for silence [s]
+    def collect(self, count: int, timeout: float) -> Sequence[bytes]: ...  # waits for that many, or for silence [s]
 
     def wait(self, timeout: float) -> bool: ...  # readable within timeout [s]
 

@@ -1,11 +1,14 @@
 """A whole cycle in one pass is what the codecs say frame by frame, and anything less than whole is not taken."""
 
+import functools
+import operator
 import random
 
 import numpy as np
 import pytest
 
 from rtctl.protocol import batch, e2e, frame, mit
+from rtctl.types import Frames
 
 N = 7
 IDS = tuple(range(1, N + 1))
@@ -24,6 +27,19 @@ def replies(rng: random.Random, protected: bool, fd: bool, counters: list[int]) 
     return out
 
 
+def receivers_at(last: list[int]) -> e2e.Receivers:
+    """Streams of which these counters came last."""
+    receivers = e2e.Receivers(len(last))
+    receivers.last[:] = last
+    return receivers
+
+
+def decoded(cycle: batch.Cycle, raw: list[bytes], receivers: e2e.Receivers) -> batch.Replies | None:
+    """What the batch codec makes of frames, if they have one size."""
+    frames = Frames.of(raw)
+    return None if frames is None else batch.decode(cycle, frames, receivers, 0.25)
+
+
 @pytest.mark.parametrize(("protected", "fd"), KINDS)
 def test_replies_in_any_order_mean_what_the_codec_of_one_says(protected: bool, fd: bool) -> None:
     rng = random.Random(1)
@@ -34,15 +50,19 @@ def test_replies_in_any_order_mean_what_the_codec_of_one_says(protected: bool, f
         data = [frame.unpack(each).data for each in raw]
         wanted = [mit.decode_reply(each[:8], scale) for each, scale in zip(data, SCALES, strict=True)]
         rng.shuffle(raw)
-        got = batch.decode(cycle, raw, last)
+        receivers = receivers_at(last)
+        got = decoded(cycle, raw, receivers)
         assert got is not None
-        assert got.whole
+        assert got.state[3].tolist() == [0.25] * N
+        assert got.codes[5].tolist() == [1] * N
         for j, one in enumerate(wanted):
             assert one is not None
-            assert tuple(got.state[:, j]) == (one.p, one.v, one.t)
+            assert tuple(got.state[:3, j]) == (one.p, one.v, one.t)
             assert tuple(got.codes[:3, j]) == (one.err, one.t_mos, one.t_rotor)
             if protected:
-                assert tuple(got.codes[3:, j]) == (data[j][8], data[j][9])
+                assert tuple(got.codes[3:5, j]) == (data[j][8], data[j][9])
+                assert receivers.last[j] == data[j][8]
+        assert got.report == (functools.reduce(operator.or_, [each[9] for each in data]) if protected else 0)
 
 
 @pytest.mark.parametrize(("protected", "fd"), KINDS)
@@ -68,8 +88,10 @@ def test_what_is_not_whole_is_not_taken() -> None:
     last = [0] * N
 
     def taken(raw: list[bytes]) -> bool:
-        got = batch.decode(cycle, raw, last)
-        return got is not None and got.whole
+        receivers = receivers_at(last)
+        got = decoded(cycle, raw, receivers)
+        assert got is not None or receivers.last.tolist() == last  # all or nothing
+        return got is not None
 
     whole = replies(rng, True, True, [1] * N)
     assert taken(whole)

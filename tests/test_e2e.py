@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtctl.protocol import e2e
-from rtctl.protocol.e2e import Check, Receiver, sequence
+from rtctl.protocol.e2e import Check, Receivers, sequence
 
 payloads = st.binary(min_size=8, max_size=8)
 identifiers = st.integers(0, 0x7FF)
@@ -97,41 +97,41 @@ def test_an_older_frame_is_not_used(last: int, older: int) -> None:
 
 
 def test_two_frames_that_overtook_each_other() -> None:
-    receiver = Receiver()
-    verdicts = [receiver.judge(counter) for counter in (1, 3, 2, 4)]
+    receiver = Receivers(1)
+    verdicts = [receiver.judge(0, counter) for counter in (1, 3, 2, 4)]
     assert [v.fresh for v in verdicts] == [True, True, False, True]
     assert [v.lost for v in verdicts] == [0, 1, -1, 0]
 
 
 def test_disorder_saturates_and_recedes() -> None:
-    receiver = Receiver()
-    receiver.judge(0)
+    receiver = Receivers(1)
+    receiver.judge(0, 0)
     for step in range(1, 9):
-        receiver.judge(2 * step)  # every other frame lost
-        assert receiver.disorder == min(step, e2e.DISORDER_LIMIT)
+        receiver.judge(0, 2 * step)  # every other frame lost
+        assert receiver.disorder[0] == min(step, e2e.DISORDER_LIMIT)
     for step in range(1, 9):
-        receiver.judge(16 + step)
-        assert receiver.disorder == max(e2e.DISORDER_LIMIT - step, 0)
+        receiver.judge(0, 16 + step)
+        assert receiver.disorder[0] == max(e2e.DISORDER_LIMIT - step, 0)
 
 
 def test_a_drive_that_counts_anew_is_followed_again_once_it_was_reported() -> None:
-    receiver = Receiver()
-    receiver.restart(100)
+    receiver = Receivers(1)
+    receiver.restart(0, 100)
     verdicts = []
     for counter in range(1, 9):
-        verdicts.append(receiver.judge(counter).fresh)
+        verdicts.append(receiver.judge(0, counter).fresh)
         if verdicts[-1]:
             break
     assert verdicts == [False] * (e2e.DISORDER_LIMIT + 1) + [True]
-    assert receiver.disorder == e2e.DISORDER_LIMIT - 1
+    assert receiver.disorder[0] == e2e.DISORDER_LIMIT - 1
 
 
 @given(st.lists(bytes8, max_size=60))
 def test_a_frame_is_never_used_twice_in_a_row_whatever_comes(counters: list[int]) -> None:
-    receiver, followed = Receiver(), -1
+    receiver, followed = Receivers(1), -1
     for counter in counters:
-        if receiver.judge(counter).fresh:
+        if receiver.judge(0, counter).fresh:
             assert counter != followed
-        if receiver.last == counter:  # used, or taken up as the start of a drive that counts anew
+        if receiver.last[0] == counter:  # used, or taken up as the start of a drive that counts anew
             followed = counter
-        assert 0 <= receiver.disorder <= e2e.DISORDER_LIMIT
+        assert 0 <= receiver.disorder[0] <= e2e.DISORDER_LIMIT

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rtctl.errors import LinkError
 from rtctl.log.record import ring as rings
 from rtctl.log.record.ring import Consumer, Producer, attach, create
+from rtctl.types import Frames
 
 Make = Callable[..., tuple[Producer, Consumer]]
 ALL = 1 << 30
@@ -95,6 +96,31 @@ def test_several_entries_are_published_together_and_partly_refused(make: Make) -
     assert producer.counts().dropped == 1
 
 
+def test_frames_in_one_piece_are_entries_of_their_own(make: Make) -> None:
+    producer, consumer = make(4096)
+    frames = [bytes([k]) * 72 for k in range(7)]
+    producer.put(1, b"before", 4)
+    assert producer.put_many(2, Frames(b"".join(frames), 72), 5)
+    assert producer.put_many(3, frames[:2], 6)
+    batch = consumer.take(ALL)
+    assert batch.kind == [1] + [2] * 7 + [3] * 2
+    assert batch.number == list(range(1, 11))
+    assert batch.time == [4] + [5] * 7 + [6] * 2
+    assert batch.sequence == [1, *range(1, 10)]
+    assert [bytes(p) for p in batch.payload] == [b"before", *frames, *frames[:2]]
+
+
+def test_frames_in_one_piece_that_do_not_fit_are_counted_one_by_one(make: Make) -> None:
+    producer, consumer = make(4096)
+    many = Frames(bytes(16 * 100), 16)
+    assert [producer.put_many(2, many, 0) for _ in range(3)] == [True, True, False]
+    assert producer.counts().dropped == 100
+    assert len(taken(consumer)) == 200
+    consumer.release()
+    assert producer.put_many(2, many, 0)  # over the end of the area
+    assert (producer.counts().number, consumer.take(ALL).number) == (400, list(range(301, 401)))
+
+
 @given(st.lists(st.tuples(st.integers(0, 1500), st.sampled_from(["keep", "take", "release"])), max_size=120))
 def test_any_interleaving_delivers_every_accepted_entry_once_and_in_order(steps: list[tuple[int, str]]) -> None:
     producer = create(f"test-{os.getpid()}.ring", 4096, b"", [rings.SHM if rings.SHM.is_dir() else Path("/tmp")])
@@ -144,7 +170,7 @@ def test_an_entry_that_makes_no_sense_ends_the_taking_but_not_the_consumer(make:
     assert consumer.drained
 
 
-@pytest.mark.parametrize("content", [b"", b"x" * 100, bytes(8192), b"RTCTRNG1" + b"\xff" * 9000])
+@pytest.mark.parametrize("content", [b"", b"x" * 100, bytes(8192), b"RTCTRNG2" + b"\xff" * 9000])
 def test_a_file_that_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "other"
     path.write_bytes(content)

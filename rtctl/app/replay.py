@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -112,7 +112,7 @@ def other(path: Path, run: Run) -> tuple[Config, Robot]:
 class _Null:
     """A bus that takes everything."""
 
-    def send_all(self, frames: list[bytes]) -> list[bytes]:
+    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]:
         return frames
 
 

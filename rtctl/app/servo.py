@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from rtctl.hal.can.link import CanLink
 from rtctl.hal.clock import Slot
 from rtctl.log.record import checkpoint
 from rtctl.log.record.requests import encode_event, encode_request
-from rtctl.types import Command, Drive, Feedback, Record, Request, Status, Task
+from rtctl.types import Command, Drive, Feedback, Frames, Record, Request, Status, Task
 
 TICK, CAN_TX, CAN_RX, EVENT, REQUEST, CHECKPOINT = 1, 2, 3, 4, 5, 9  # kinds of the log's messages
 QUIET = Request()
@@ -24,7 +24,7 @@ QUIET = Request()
 class Sink(Protocol):
     """Where messages go: the recorder's ring, or a file."""
 
-    def put_many(self, kind: int, payloads: list[bytes], time_ns: int) -> bool: ...
+    def put_many(self, kind: int, payloads: Sequence[bytes], time_ns: int) -> bool: ...
 
 
 class Machine(NamedTuple):
@@ -45,7 +45,7 @@ class Turn(NamedTuple):
     feedback: Feedback
     command: Command
     record: Record
-    frames: list[bytes]  # sent
+    frames: Sequence[bytes]  # sent
 
 
 def first_feedback(q: np.ndarray) -> Feedback:
@@ -99,7 +99,7 @@ class Servo:
         self.memory, command, record = self.machine.tick(self.robot, before, feedback, request)
         sent = self.machine.harmless(command) if self.dry else command
         frames = self.link.write(sent)
-        self.digest.update(b"".join(frames))
+        self.digest.update(frames.data if type(frames) is Frames else b"".join(frames))
         self.missed += slot.missed
         self.lateness = slot.lateness
         self.faults_seen |= self.memory.in_force
@@ -122,7 +122,7 @@ class Servo:
         self,
         feedback: Feedback,
         record: Record,
-        frames: list[bytes],
+        frames: Sequence[bytes],
         request: Request,
         now: float,
         news: list[tuple[str, str]],

@@ -9,7 +9,7 @@ import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.protocol import e2e, frame, mit
-from rtctl.types import F64, I64, U8
+from rtctl.types import F64, I64, U8, Frames
 
 _DATA = 8  # where the data begin in a raw frame
 _AT_LENGTH = 4
@@ -37,15 +37,15 @@ class Cycle(NamedTuple):
     scale: F64  # (n, 3) p_max [rad], v_max [rad/s], t_max [Nm]
     can_id: I64  # (n,) of commands; replies come under mit.REPLY_OFFSET more
     words: U8  # (n, 4) the first bytes of each reply
-    template: U8  # (n, size) commands of 0 Nm, unprotected
+    block: U8  # (n, size) the commands: `encode` writes torque and protection, the rest stays
 
 
 class Replies(NamedTuple):
-    """A cycle's replies by joint."""
+    """A cycle's replies by joint; fresh arrays, nobody writes them any more."""
 
-    whole: bool  # one intact reply of each, each the next in its sequence; otherwise the rest means nothing
-    state: F64  # (3, n) position [rad], velocity [rad/s], torque [Nm]
-    codes: I64  # (5, n) drive status, temperatures [degC] of driver and coil, counter, report
+    state: F64  # (4, n) position [rad], velocity [rad/s], torque [Nm], age [s]
+    codes: I64  # (6, n) drive status, temperatures [degC] of driver and coil, counter, report, number of replies: 1
+    report: int  # all e2e.Report bits that some joint says
 
 
 def cycle_of(protected: bool, fd: bool, can_ids: tuple[int, ...], scales: tuple[mit.Scale, ...]) -> Cycle:
@@ -63,66 +63,82 @@ def cycle_of(protected: bool, fd: bool, can_ids: tuple[int, ...], scales: tuple[
     )
 
 
-def decode(cycle: Cycle, raw: list[bytes], last: list[int]) -> Replies | None:
-    """Return the replies in raw frames of any order, None unless they are of the right number and size.
+def decode(cycle: Cycle, frames: Frames, receivers: e2e.Receivers, age: float) -> Replies | None:
+    """Return the replies in raw frames of any order, and count on in `receivers`; `age` [s] is passed on.
 
-    last: counter of the newest reply of each joint, for protected frames.
+    None, and nothing taken, unless there is one intact reply of each joint, each the next of a stream in order.
     """
-    n, size = cycle.template.shape
-    if len(raw) != n or set(map(len, raw)) != {size}:
+    n, size = cycle.block.shape
+    if frames.size != size or len(frames.data) != n * size:
         return None
-    frames = np.frombuffer(b"".join(raw), np.uint8).reshape(n, size)
-    return Replies(*_decode(frames, cycle.protected, cycle.scale, cycle.can_id, cycle.words, np.array(last)))
+    state, codes = np.empty((4, n)), np.zeros((6, n), np.int64)
+    raw = np.frombuffer(frames.data, np.uint8)
+    last, disorder = receivers.last, receivers.disorder
+    report = _decode(
+        raw, size, cycle.protected, cycle.scale, cycle.can_id, cycle.words, last, disorder, age, state, codes
+    )
+    return None if report < 0 else Replies(state, codes, report)
 
 
-def encode(cycle: Cycle, tau: F64, counters: I64) -> list[bytes]:
+def encode(cycle: Cycle, tau: F64, counters: I64) -> Frames:
     """Return a raw frame of torque [Nm] for each joint; counts on in `counters` (n,) where frames are protected."""
-    out = cycle.template.copy()
-    _encode(out, cycle.protected, cycle.scale, cycle.can_id, tau, counters)
-    raw, size = out.tobytes(), out.shape[1]
-    return [raw[at : at + size] for at in range(0, len(raw), size)]
+    block = cycle.block
+    _encode(block, cycle.protected, cycle.scale, cycle.can_id, tau, counters)
+    return Frames(block.tobytes(), block.shape[1])
 
 
 @kernel
-def _crc(data: U8, can_id: int) -> int:
+def _crc(raw: U8, at: int, can_id: int) -> int:
     crc: int = 0xFFFF
-    for i in range(e2e.COVERED):
-        crc = (crc << 8 & 0xFFFF) ^ _TABLE[crc >> 8 ^ data[i]]
+    for i in range(at, at + e2e.COVERED):
+        crc = (crc << 8 & 0xFFFF) ^ _TABLE[crc >> 8 ^ raw[i]]
     crc = (crc << 8 & 0xFFFF) ^ _TABLE[crc >> 8 ^ (can_id >> 8)]
     return int((crc << 8 & 0xFFFF) ^ _TABLE[crc >> 8 ^ (can_id & 0xFF)])
 
 
 @kernel
-def _decode(frames: U8, protected: bool, scale: F64, can_id: I64, words: U8, last: I64) -> tuple[bool, F64, I64]:
-    n = frames.shape[0]
-    state, codes, seen = np.empty((3, n)), np.zeros((5, n), np.int64), np.zeros(n, np.bool_)
+def _decode(
+    raw: U8, size: int, protected: bool, scale: F64, can_id: I64, words: U8, last: I64, disorder: I64, age: float,
+    state: F64, codes: I64,
+) -> int:  # fmt: skip
+    """Fill state and codes and count on in `last`; return the reports' bits, -1 (and leave `last`) if not whole."""
+    n, report = len(can_id), 0
     for i in range(n):
+        head, at = i * size, i * size + _DATA
         j = 0
         while j < n and not (
-            frames[i, 0] == words[j, 0]
-            and frames[i, 1] == words[j, 1]
-            and frames[i, 2] == words[j, 2]
-            and frames[i, 3] == words[j, 3]
+            raw[head] == words[j, 0]
+            and raw[head + 1] == words[j, 1]
+            and raw[head + 2] == words[j, 2]
+            and raw[head + 3] == words[j, 3]
         ):
             j += 1
-        if j == n or seen[j] or frames[i, _AT_LENGTH] != (e2e.LENGTH if protected else mit.LENGTH):
-            return False, state, codes
-        seen[j] = True
-        data = frames[i, _DATA:]
-        if data[0] & 0xF != can_id[j] & 0xF:
-            return False, state, codes
+        if j == n or codes[5, j] != 0 or raw[head + _AT_LENGTH] != (e2e.LENGTH if protected else mit.LENGTH):
+            return -1
+        codes[5, j] = 1
+        if raw[at] & 0xF != can_id[j] & 0xF:
+            return -1
         if protected:
-            sent = np.int64(data[e2e.COVERED]) << 8 | np.int64(data[e2e.COVERED + 1])
-            if _crc(data, can_id[j] + mit.REPLY_OFFSET) != sent or data[8] != (last[j] + 1) & 0xFF:
-                return False, state, codes
-            codes[3, j], codes[4, j] = data[8], data[9]
-        b = data[:8].astype(np.int64)
+            sent = np.int64(raw[at + e2e.COVERED]) << 8 | np.int64(raw[at + e2e.COVERED + 1])
+            counter = np.int64(raw[at + 8])
+            if _crc(raw, at, can_id[j] + mit.REPLY_OFFSET) != sent or disorder[j] != 0:
+                return -1
+            if counter != (last[j] + 1) & 0xFF:
+                return -1
+            codes[3, j], codes[4, j] = counter, raw[at + 9]
+            report |= codes[4, j]
+        b1, b2, b3 = np.int64(raw[at + 1]), np.int64(raw[at + 2]), np.int64(raw[at + 3])
+        b4, b5 = np.int64(raw[at + 4]), np.int64(raw[at + 5])
         p_max, v_max, t_max = scale[j, 0], scale[j, 1], scale[j, 2]
-        state[0, j] = (b[1] << 8 | b[2]) * (2.0 * p_max / 65535.0) - p_max
-        state[1, j] = (b[3] << 4 | b[4] >> 4) * (2.0 * v_max / 4095.0) - v_max
-        state[2, j] = ((b[4] & 0xF) << 8 | b[5]) * (2.0 * t_max / 4095.0) - t_max
-        codes[0, j], codes[1, j], codes[2, j] = b[0] >> 4, b[6], b[7]
-    return True, state, codes
+        state[0, j] = (b1 << 8 | b2) * (2.0 * p_max / 65535.0) - p_max
+        state[1, j] = (b3 << 4 | b4 >> 4) * (2.0 * v_max / 4095.0) - v_max
+        state[2, j] = ((b4 & 0xF) << 8 | b5) * (2.0 * t_max / 4095.0) - t_max
+        state[3, j] = age
+        codes[0, j], codes[1, j], codes[2, j] = raw[at] >> 4, raw[at + 6], raw[at + 7]
+    if protected:
+        for j in range(n):
+            last[j] = codes[3, j]
+    return report
 
 
 @kernel
@@ -131,17 +147,17 @@ def _encode(out: U8, protected: bool, scale: F64, can_id: I64, tau: F64, counter
         t_max = scale[j, 2]
         t = tau[j] if np.isfinite(tau[j]) else 0.0
         code = np.int64(min(max((t + t_max) * 4095 / (t_max + t_max), 0.0), 4095) + 0.5)
-        data = out[j, _DATA:]
-        data[6], data[7] = code >> 8, code & 0xFF
+        data = out[j]
+        data[_DATA + 6], data[_DATA + 7] = code >> 8, code & 0xFF
         if protected:
             counters[j] = (counters[j] + 1) & 0xFF
-            data[8], data[9] = counters[j], _WANTED
-            crc = _crc(data, can_id[j])
-            data[10], data[11] = crc >> 8, crc & 0xFF
+            data[_DATA + 8], data[_DATA + 9] = counters[j], _WANTED
+            crc = _crc(data, _DATA, can_id[j])
+            data[_DATA + 10], data[_DATA + 11] = crc >> 8, crc & 0xFF
 
 
 def warm(cycle: Cycle) -> None:
     """Compile or load both kernels; no frame is needed."""
-    n = len(cycle.can_id)
-    _encode(cycle.template.copy(), cycle.protected, cycle.scale, cycle.can_id, np.zeros(n), np.zeros(n, np.int64))
-    decode(cycle, [bytes(cycle.template.shape[1])] * n, [0] * n)
+    n, size = cycle.block.shape
+    encode(cycle, np.zeros(n), np.zeros(n, np.int64))
+    decode(cycle, Frames(bytes(n * size), size), e2e.Receivers(n), 0.0)

@@ -10,6 +10,10 @@ from binascii import crc_hqx
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
+import numpy as np
+
+from rtctl.types import I64
+
 LENGTH = 12
 PAYLOAD = 8
 COVERED = 10  # payload, counter, status
@@ -56,9 +60,6 @@ class Received(NamedTuple):
         return self.check is Check.OK or (self.check is Check.WRONGSEQUENCE and self.lost > 0)
 
 
-_OK = Received(Check.OK)
-
-
 def crc(data: bytes, can_id: int) -> int:
     """Return the CRC of ten covered bytes `data` sent under `can_id`."""
     return crc_hqx(can_id.to_bytes(2, "big"), crc_hqx(data, 0xFFFF))
@@ -92,35 +93,32 @@ def sequence(last: int, counter: int) -> Received:
     return Received(Check.WRONGSEQUENCE, step - 1 if step < 128 else step - 256)
 
 
-class Receiver:
-    """The receiving end of one protected stream: the newest counter, and how disordered the stream is."""
+class Receivers:
+    """The receiving ends of n protected streams: the newest counter of each, and how disordered it is."""
 
     __slots__ = ("disorder", "last")
 
-    def __init__(self) -> None:
-        self.last = -1  # counter of the newest frame taken
-        self.disorder = 0  # 0..5: wrong sequences up, right ones down
+    def __init__(self, n: int) -> None:
+        self.last: I64 = np.full(n, -1)  # counter of the newest frame taken
+        self.disorder: I64 = np.zeros(n, np.int64)  # 0..5: wrong sequences up, right ones down
 
-    def restart(self, counter: int) -> None:
+    def restart(self, stream: int, counter: int) -> None:
         """Take a frame as the first of a new stream."""
-        self.last, self.disorder = counter, 0
+        self.last[stream], self.disorder[stream] = counter, 0
 
-    def judge(self, counter: int) -> Received:
+    def judge(self, stream: int, counter: int) -> Received:
         """Return the verdict on a frame whose CRC was right, and remember it.
 
         A stream that stays wrong (a drive that began to count anew) is taken up again once `disorder` is full: by
         then the fault is reported, and damping the arm needs its angles.
         """
-        if counter == (self.last + 1) & 0xFF and not self.disorder:  # nearly always
-            self.last = counter
-            return _OK
-        received = sequence(self.last, counter)
+        disorder = int(self.disorder[stream])
+        received = sequence(int(self.last[stream]), counter)
         if received.check is Check.OK:
-            self.disorder = max(self.disorder - 1, 0)
-            self.last = counter
+            self.disorder[stream] = max(disorder - 1, 0)
+            self.last[stream] = counter
         elif received.check is Check.WRONGSEQUENCE:
-            full = self.disorder == DISORDER_LIMIT
-            self.disorder = min(self.disorder + 1, DISORDER_LIMIT)
-            if received.lost > 0 or full:
-                self.last = counter
+            self.disorder[stream] = min(disorder + 1, DISORDER_LIMIT)
+            if received.lost > 0 or disorder == DISORDER_LIMIT:
+                self.last[stream] = counter
         return received

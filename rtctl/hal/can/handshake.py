@@ -128,7 +128,7 @@ def _positions(talk: "_Talk", recover: bool) -> F64:
             wanted = f"{spec.q_min:g} to {spec.q_max:g} rad, or recover"
             raise HandshakeError(f"{talk.place(j)}: position", f"{reply.p:.4f} rad", wanted)
         if talk.link.protected:
-            talk.link.receivers[j].restart(data[8] - 1 & 0xFF)  # the first read judges this reply again
+            talk.link.receivers.restart(j, data[8] - 1 & 0xFF)  # the first read judges this reply again
         q.append(reply.p)
     return np.array(q)
 
@@ -240,7 +240,7 @@ class _Talk:
         if self.link.spec.fd and not frame.unpack(raw).brs:
             raise HandshakeError(f"{self.place(joint)}: reply", "CAN FD without bit-rate switch", self._kind())
         if self.link.protected:
-            self.link.receivers[joint].restart(data[8])
+            self.link.receivers.restart(joint, data[8])
         return data
 
     def _kind(self) -> str:

@@ -5,13 +5,13 @@ when the command that it answers arrived, which is one slot ago on a healthy bus
 """
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.protocol import batch, e2e, frame, mit
-from rtctl.types import F64, I64, Command, Drive, Feedback, Link, Transport
+from rtctl.types import F64, I64, Command, Drive, Feedback, Frames, Link, Transport
 
 MIT, MIT_E2E = "mit", "mit+e2e"
 _SPECIAL = {Drive.DISABLE: mit.DISABLE, Drive.ENABLE: mit.ENABLE, Drive.CLEAR: mit.CLEAR}
@@ -54,11 +54,11 @@ class CanLink:
         n = len(spec.joints)
         self.spec, self.transport = spec, transport
         self.protected = spec.protocol == MIT_E2E
-        self.received: list[bytes] = []  # raw frames of the last read
+        self.received: Sequence[bytes] = []  # raw frames of the last read
         self.corrupt = self.ignored = self.foreign = 0  # frames so far
         self.bus_state = Link.NONE  # BUS_OFF or ERROR_PASSIVE while it lasts
         self.pending: list[bytes] = []  # received ahead of the next read
-        self.receivers = [e2e.Receiver() for _ in range(n)]
+        self.receivers = e2e.Receivers(n)
         self.restarted = True  # the next read comes right after a handshake
         self._counters: I64 = np.zeros(n, np.int64)
         self._length = e2e.LENGTH if self.protected else mit.LENGTH
@@ -70,14 +70,13 @@ class CanLink:
             self.protected, spec.fd, tuple(j.can_id for j in spec.joints), tuple(j.scale for j in spec.joints)
         )
         batch.warm(self._cycle)
-        self._state: F64 = np.zeros((3, n))  # position, velocity, torque of the newest reply
-        self._codes: I64 = np.zeros((5, n), np.int64)  # drive status, two temperatures, counter, report
+        self._state: F64 = np.zeros((4, n))  # of the newest reply, as batch.Replies has it
+        self._codes: I64 = np.zeros((6, n), np.int64)
         self._codes[0] = -1
-        self._replies: I64 = np.zeros(n, np.int64)
         self._sampled: I64 = np.full(n, -1)
         self._slot = -1
         self._reopen_at = 0
-        self._flags = 0
+        self._flags = self._report = 0  # Link flags of this read; e2e.Report bits of the newest replies
 
     @property
     def status(self) -> list[int]:
@@ -110,14 +109,13 @@ class CanLink:
         """Go on counting a joint's protected frames behind `counter`: a replay takes up a log's count."""
         self._counters[joint] = counter & 0xFF
 
-    def write(self, command: Command) -> list[bytes]:
+    def write(self, command: Command) -> Sequence[bytes]:
         """Send one frame to each joint, or drop it; return the raw frames that went out."""
         special = _SPECIAL.get(command.drive)
-        if special is not None:
-            frames = [self.encode(j, special) for j in range(len(self.spec.joints))]
-        else:
-            frames = batch.encode(self._cycle, command.tau, self._counters)
-        return self.transport.send_all(frames)
+        if special is None:
+            return self.transport.send_all(batch.encode(self._cycle, command.tau, self._counters))
+        frames = b"".join([self.encode(j, special) for j in range(len(self.spec.joints))])
+        return self.transport.send_all(Frames(frames, self._size))
 
     # ---- in
 
@@ -126,30 +124,20 @@ class CanLink:
         self._flags = 0
         asked = slot - 1 if self.restarted else self._slot  # the slot of the commands that are answered now
         self._slot, self.restarted = slot, False
-        self.received = [*self.pending, *self.transport.receive()]
-        self.pending = []
-        if not self._take_whole(asked):
-            self._take_each(asked)
+        received = self.transport.receive()
+        if self.pending:
+            received, self.pending = [*self.pending, *received], []
+        self.received = received
+        if not self._take_whole(slot, asked):
+            self._take_each(slot, asked)
         self._flags |= self.transport.flags() | int(self.bus_state)
-        if self.protected and int(np.bitwise_or.reduce(self._codes[4])) & _LESS:
+        if self._report & _LESS:
             self._flags |= _DERATED
         if self._flags & _DOWN:
             self._reopen(slot)
-        q, qd, tau = self._state.copy()
-        age = np.multiply(slot - self._sampled, self.spec.period, dtype=np.float64)
-        return Feedback(
-            slot,
-            missed,
-            q,
-            qd,
-            tau,
-            age,
-            self._replies.copy(),
-            self._codes[0].copy(),
-            int(self._flags),
-            lateness,
-            compute,
-        )
+        q, qd, tau, age = self._state
+        codes = self._codes
+        return Feedback(slot, missed, q, qd, tau, age, codes[5], codes[0], int(self._flags), lateness, compute)
 
     def joint_of(self, raw: bytes) -> int | None:
         """Return the joint that a raw frame is a reply of, or None."""
@@ -168,30 +156,30 @@ class CanLink:
         """True if a frame carries an identifier that only this program may send."""
         return raw[:4] in self._ours
 
-    def _take_whole(self, asked: int) -> bool:
+    def _take_whole(self, slot: int, asked: int) -> bool:
         """Take a cycle in which all is as it should be; return False, with nothing taken, if anything is not."""
-        if any(receiver.disorder for receiver in self.receivers):
+        frames = Frames.of(self.received)
+        if frames is None:
             return False
-        got = batch.decode(self._cycle, self.received, [receiver.last for receiver in self.receivers])
-        if got is None or not got.whole:
+        got = batch.decode(self._cycle, frames, self.receivers, (slot - asked) * self.spec.period)
+        if got is None:
             return False
-        self._state, self._codes = got.state, got.codes
-        if self.protected:
-            for receiver, counter in zip(self.receivers, got.codes[3].tolist(), strict=True):
-                receiver.last = counter
-        self._replies.fill(1)
+        self._state, self._codes, self._report = got
         self._sampled.fill(asked)
         return True
 
-    def _take_each(self, asked: int) -> None:
+    def _take_each(self, slot: int, asked: int) -> None:
         """Take what came, frame by frame."""
-        self._replies.fill(0)
+        self._state, self._codes = self._state.copy(), self._codes.copy()  # the feedback before this has the old ones
+        self._codes[5] = 0
         for raw in self.received:
             self._take(raw, asked)
-        if self._replies.max() > 1:
+        if self._codes[5].max() > 1:
             self._flags |= _DUPLICATE
-        if any(receiver.disorder == e2e.DISORDER_LIMIT for receiver in self.receivers):
+        if self.receivers.disorder.max() == e2e.DISORDER_LIMIT:
             self._flags |= _DISORDER
+        self._state[3] = np.multiply(slot - self._sampled, self.spec.period, dtype=np.float64)
+        self._report = int(np.bitwise_or.reduce(self._codes[4]))
 
     def _take(self, raw: bytes, asked: int) -> None:
         joint = self._joint_of.get(raw[:4])
@@ -207,19 +195,19 @@ class CanLink:
             return
         if self.protected and not self._in_sequence(joint, data):
             return
-        self._state[:, joint] = reply.p, reply.v, reply.t
+        self._state[:3, joint] = reply.p, reply.v, reply.t
         self._codes[:3, joint] = reply.err, reply.t_mos, reply.t_rotor
         self._sampled[joint] = asked
-        self._replies[joint] += 1
+        self._codes[5, joint] += 1
 
     def _in_sequence(self, joint: int, data: bytes) -> bool:
-        received = self.receivers[joint].judge(data[8])
+        received = self.receivers.judge(joint, data[8])
         if received.check is e2e.Check.REPEATED:
             self._flags |= Link.DUPLICATE
         elif received.check is e2e.Check.WRONGSEQUENCE:
             self._flags |= Link.SEQUENCE
         if received.fresh:
-            self._codes[3:, joint] = data[8], data[9]
+            self._codes[3:5, joint] = data[8], data[9]
         return received.fresh
 
     def take_stranger(self, raw: bytes) -> None:

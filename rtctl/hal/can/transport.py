@@ -31,7 +31,7 @@ class _Socket:
     """Transport over a datagram socket; the base of SocketCan and Seqpacket."""
 
     def __init__(self, sock: socket.socket, ancillary: bool) -> None:
-        self._flags = Link.NONE
+        self._flags = 0
         self._adopt(sock, ancillary)
 
     def _adopt(self, sock: socket.socket, ancillary: bool) -> None:
@@ -41,18 +41,21 @@ class _Socket:
         self._dropped = 0
 
     def _note(self) -> None:
-        error, self._messages.error = self._messages.error, 0
+        messages = self._messages
+        if not messages.error and messages.dropped == self._dropped:  # nearly always
+            return
+        error, messages.error = messages.error, 0
         if error:
             self._flags |= Link.SEND_FAILED if error in _CONGESTED else Link.DOWN
-        if self._messages.dropped != self._dropped:
-            self._dropped = self._messages.dropped
+        if messages.dropped != self._dropped:
+            self._dropped = messages.dropped
             self._flags |= Link.OVERFLOW
 
     def send(self, raw: bytes) -> bool:
         """Send one frame or drop it; False: dropped."""
         return len(self.send_all([raw])) == 1
 
-    def send_all(self, frames: list[bytes]) -> list[bytes]:
+    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]:
         """Send each frame or drop it; return those that went out."""
         went = self._messages.send(frames)
         if len(went) != len(frames):
@@ -60,13 +63,13 @@ class _Socket:
             self._flags |= Link.SEND_FAILED
         return went
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> Sequence[bytes]:
         """Return everything that waits."""
         frames = self._messages.receive()
         self._note()
         return frames
 
-    def collect(self, count: int, timeout: float) -> list[bytes]:
+    def collect(self, count: int, timeout: float) -> Sequence[bytes]:
         """Return `count` frames, or those that came until none came for `timeout` [s]."""
         frames = self._messages.collect(count, timeout)
         self._note()
@@ -78,7 +81,7 @@ class _Socket:
 
     def flags(self) -> int:
         """Return the Link flags since the last call."""
-        flags, self._flags = self._flags, Link.NONE
+        flags, self._flags = self._flags, 0
         return int(flags)
 
     def close(self) -> None:
@@ -188,11 +191,11 @@ class PythonCan:
             return False
         return True
 
-    def send_all(self, frames: list[bytes]) -> list[bytes]:
+    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]:
         """Send each frame or drop it; return those that went out."""
         return [raw for raw in frames if self.send(raw)]
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> Sequence[bytes]:
         """Return everything that waits."""
         while self._receive_one(0.0):
             pass
@@ -221,7 +224,7 @@ class PythonCan:
             )
         return True
 
-    def collect(self, count: int, timeout: float) -> list[bytes]:
+    def collect(self, count: int, timeout: float) -> Sequence[bytes]:
         """Return `count` frames, or those that came until none came for `timeout` [s]."""
         while len(self._waiting) < count and self._receive_one(timeout):
             pass
@@ -266,17 +269,17 @@ class InProcess:
         """Send one frame."""
         return len(self.send_all([raw])) == 1
 
-    def send_all(self, frames: list[bytes]) -> list[bytes]:
+    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]:
         """Send all frames of a cycle at once."""
-        self._waiting += self._exchange(frames)
+        self._waiting += self._exchange(list(frames))
         return frames
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> Sequence[bytes]:
         """Return everything that waits."""
         frames, self._waiting = self._waiting, []
         return frames
 
-    def collect(self, count: int, timeout: float) -> list[bytes]:
+    def collect(self, count: int, timeout: float) -> Sequence[bytes]:
         """Return everything that waits: nothing more would come."""
         return self.receive()
 

@@ -4,6 +4,8 @@ The producer writes an entry behind `head` and then moves `head`; the consumer c
 they are safe on disk, moves `tail`. Positions count bytes since the start and never wrap. When an entry does not fit,
 it is dropped, and it keeps its numbers: the hole tells the consumer how many were lost and where.
 
+A cycle's frames, all of one size, are put as one piece of several parts; each part is an entry for the consumer.
+
 Memory order. Correctness needs two things: the 8-byte stores of `head` and `tail` are not torn, and the entry's bytes
 are visible before the `head` that publishes them (and have been copied before the `tail` that frees them).
  * A word is stored by assigning to a `memoryview` cast to "Q", which CPython does with one 8-byte memcpy to an aligned
@@ -31,13 +33,15 @@ from typing import NamedTuple
 from rtctl.errors import LinkError
 from rtctl.log.entry import Batch, Payload, empty, stream
 from rtctl.trust import open_file
+from rtctl.types import Frames
 
-MAGIC = 0x31474E5254435452  # "RTCTRNG1"
+MAGIC = 0x32474E5254435452  # "RTCTRNG2"
 PAGE = 4096
 SHM = Path("/dev/shm")
-HEAD = struct.Struct("@IIQQII")  # length, kind, number, time, sequence, spare
+HEAD = struct.Struct("@IIQQII")  # length, kind, number, time, sequence, parts
 WRAP_MARK = struct.Struct("@I")
 HEAD_SIZE = HEAD.size
+PARTS = 512  # frames that one drain of a bus can bring: 8 calls of 64
 WRAP = 0xFFFFFFFF  # in place of a length: go on at the start
 SLACK = 64  # so that a header can be read at the very end
 
@@ -171,6 +175,8 @@ class Producer(Ring):
 
     def put_many(self, kind: int, payloads: Sequence[Payload], time_ns: int) -> bool:
         """Put several entries of one kind and time, published at once; False when any did not fit."""
+        if type(payloads) is Frames and 0 < len(payloads) <= PARTS:
+            return self._put_parts(kind, payloads, time_ns)
         position = self._head
         number = self._number
         at_stream = stream(kind)
@@ -190,11 +196,38 @@ class Producer(Ring):
                     continue
                 position = start
             at = self.data_at + (position & self.mask)
-            HEAD.pack_into(area, at, size, kind, number, time_ns, sequence & 0xFFFFFFFF, 0)
+            HEAD.pack_into(area, at, size, kind, number, time_ns, sequence & 0xFFFFFFFF, 1)
             at += HEAD_SIZE
             area[at : at + size] = payload
             position += need
         self._sequence[at_stream] = sequence
+        self._publish(position, number, time_ns)
+        return fitted
+
+    def _put_parts(self, kind: int, frames: Frames, time_ns: int) -> bool:
+        """Put frames in one piece; all of them are dropped when they do not fit."""
+        count, size = len(frames), len(frames.data)
+        number = self._number
+        at_stream = stream(kind)
+        sequence = self._sequence[at_stream]
+        need = (size + HEAD_SIZE + 7) & ~7
+        position = start = self._head
+        if position + need > self._limit:
+            start = self._place(position, need)
+        if start >= 0:
+            at = self.data_at + (start & self.mask)
+            HEAD.pack_into(self.map, at, size, kind, number + 1, time_ns, (sequence + 1) & 0xFFFFFFFF, count)
+            at += HEAD_SIZE
+            self.map[at : at + size] = frames.data
+            position = start + need
+        else:
+            self._dropped += count
+        self._sequence[at_stream] = sequence + count
+        self._publish(position, number + count, time_ns)
+        return start >= 0
+
+    def _publish(self, position: int, number: int, time_ns: int) -> None:
+        """Show the consumer what was put up to `position`, and how many entries were offered."""
         self._number = number
         self._head = position
         if self._fence is not None:
@@ -203,9 +236,7 @@ class Producer(Ring):
         words[HEAD_AT] = position
         words[NUMBER] = number
         words[HEARTBEAT] = time_ns
-        if not fitted:
-            words[DROPPED] = self._dropped
-        return fitted
+        words[DROPPED] = self._dropped
 
     def _place(self, position: int, need: int) -> int:
         """Return where an entry of `need` bytes starts: here, or after a wrap mark; -1 when there is no room."""
@@ -256,19 +287,21 @@ class Consumer(Ring):
         while position < stop and not self.corrupt:
             at = position & self.mask
             start = self.data_at + at
-            length, kind, number, time, sequence, _ = HEAD.unpack_from(self.map, start)
+            length, kind, number, time, sequence, parts = HEAD.unpack_from(self.map, start)
             if length == WRAP:
                 position += self.capacity - at
                 continue
-            if at + HEAD_SIZE + length > self.capacity or position + HEAD_SIZE + length > head:
+            beyond = at + HEAD_SIZE + length > self.capacity or position + HEAD_SIZE + length > head
+            if beyond or not 0 < parts <= PARTS or length % parts:
                 self.corrupt = True
                 break
-            kinds.append(kind)
-            numbers.append(number)
-            times.append(time)
-            sequences.append(sequence)
+            size = length // parts
             start += HEAD_SIZE
-            payloads.append(view[start : start + length])
+            kinds += [kind] * parts
+            numbers += range(number, number + parts)
+            times += [time] * parts
+            sequences += [(sequence + k) & 0xFFFFFFFF for k in range(parts)]
+            payloads += [view[start + k * size : start + (k + 1) * size] for k in range(parts)]
             position += (length + HEAD_SIZE + 7) & ~7
         self.position = position
         if numbers:
