@@ -16,6 +16,7 @@ from typing import Any
 
 from firmware_sim.bus import Bus, open_bus
 from firmware_sim.camera import Camera
+from firmware_sim.cells import COMMANDED
 from firmware_sim.codec import REGISTER_ID
 from firmware_sim.drive import NS
 from firmware_sim.inject import KINDS
@@ -68,7 +69,7 @@ class Loop:
 
         A second command for a joint closes a cycle that others have missed: a lost frame must not stop time.
         """
-        simulator, everybody = self.simulator, len(self.simulator.drives)
+        simulator = self.simulator
         period = simulator.settings.period_ns / NS
         heard = time.monotonic()
         due = 0.0
@@ -87,7 +88,7 @@ class Loop:
                 if simulator.repeats(raw):
                     replies = self._advance(replies)
                 replies += simulator.answer(raw)[0]
-                if len(simulator.commanded) == everybody:
+                if simulator.bank.i[:, COMMANDED].all():
                     replies = self._advance(replies)
             self.bus.send(replies)
 

@@ -30,6 +30,7 @@ KINDS = {
 }
 FOREVER = 1 << 62
 JUMP = 0.5  # [rad]
+ONCE = frozenset(("drive_fault", "weak", "reboot"))  # done at its time, and over
 
 
 class Fault(NamedTuple):
@@ -91,6 +92,14 @@ class Injector:
         self.random = random.Random(seed)
         self.done: set[int] = set()
         self.stuck: dict[int, tuple[float, float]] = {}
+
+    def quiet(self, now: int) -> bool:
+        """Tell whether nothing is injected at time `now` [ns], nor an encoder to be let go that was stuck until now."""
+        if not self.faults:
+            return True
+        return not self.stuck and not any(
+            f.start <= now < f.end and not (k in self.done and f.kind in ONCE) for k, f in enumerate(self.faults)
+        )
 
     def active(self, kind: str, now: int, joint: int) -> bool:
         """Tell whether a fault of this kind holds for a joint at time `now` [ns]."""

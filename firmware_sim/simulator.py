@@ -12,16 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_sim import codec
-from firmware_sim.drive import NS, Drive, State
+from firmware_sim.bank import Bank
+from firmware_sim.batch import CAPACITY, Batch
+from firmware_sim.cells import LARGEST, TORQUE
+from firmware_sim.drive import NS
 from firmware_sim.inject import Injector, faults_of, parse
 from firmware_sim.plant import Plant
 from firmware_sim.rover import is_rover, open_rover
 from firmware_sim.settings import Settings, SettingsError, load
 from firmware_sim.shapes import ObstacleEdit, reported, shape_at
-from rtctl.protocol import frame
+from firmware_sim.wire import Wire, of_registers
 
 F64 = NDArray[np.float64]
+REPLIES = 2 * CAPACITY  # to a batch of frames: an injected fault answers one twice
 
 
 class Truth(NamedTuple):
@@ -51,13 +54,13 @@ class Simulator:
     ) -> None:
         """`wait`: the scenario's clock (obstacles, faults) stands at 0 until a drive is enabled."""
         self.settings = settings
-        self.drives = [Drive(r) for r in settings.ratings]
-        self.by_id = {d.rating.motor: k for k, d in enumerate(self.drives)}
-        self.plant = Plant(settings, start_q, obstacles)
+        self.bank = Bank(settings.ratings, settings.fd)
+        self.drives = self.bank.drives
         self.injector = injector
-        self.commanded: set[int] = set()  # joints that got a cyclic frame this period
-        self.max_torque = [0.0] * len(self.drives)
+        self.wire = Wire(self.bank, injector, settings.fd)
+        self.plant = Plant(settings, start_q, obstacles)
         self.started = not wait
+        self._came, self._replies = Batch(), Batch(REPLIES)
         self._steps = 0
         self._shown: set[str] = set()
         self._truth: Truth | None = None
@@ -68,57 +71,27 @@ class Simulator:
         """Simulated time [s]."""
         return self.plant.time_ns / NS
 
+    @property
+    def max_torque(self) -> list[float]:
+        """Largest torque of each drive at the end of a period so far [Nm]."""
+        largest: list[float] = self.bank.f[:, LARGEST].tolist()
+        return largest
+
     def exchange(self, frames: list[bytes]) -> list[bytes]:
         """Take the frames of one servo period, return the replies, advance one period (but for register frames)."""
-        replies, cyclic = [], not frames
-        for raw in frames:
-            reply, register = self.answer(raw)
-            cyclic = cyclic or not register
-            replies.extend(reply)
-        if cyclic:
+        said: list[bytes] = []
+        for start in range(0, len(frames), CAPACITY):
+            self._came.count = self._replies.count = 0
+            self._came.extend(frames[start : start + CAPACITY])
+            self.answer(self._came, self._replies)
+            said += self._replies.frames()
+        if not frames or not all(map(of_registers, frames)):
             self.advance()
-        return replies
+        return said
 
-    def repeats(self, raw: bytes) -> bool:
-        """Tell whether a frame commands a joint that has its command of this period already."""
-        try:
-            f = frame.unpack(raw)
-        except ValueError:
-            return False
-        return self.by_id.get(f.can_id, -1) in self.commanded and not (f.error or f.rtr or f.extended)
-
-    def answer(self, raw: bytes) -> tuple[list[bytes], bool]:
-        """Take one frame; return the replies to it and whether it was a register frame."""
-        try:
-            f = frame.unpack(raw)
-        except ValueError:
-            return [], False
-        if f.error or f.rtr or f.extended:
-            return [], False
-        if f.can_id == codec.REGISTER_ID:
-            return self._register(f), True
-        k = self.by_id.get(f.can_id, -1)
-        if k < 0 or f.fd != self.settings.fd:
-            return [], False
-        self.commanded.add(k)
-        data = self.injector.command(self.plant.scene_ns, k, f.data)
-        reply = self.drives[k].receive(data) if data is not None else None
-        return self._sent(k, reply), False
-
-    def _register(self, f: frame.Frame) -> list[bytes]:
-        if f.fd != self.settings.fd or len(f.data) < 8:
-            return []
-        k = self.by_id.get(codec.decode_register(f.data).motor, -1)
-        return self._sent(k, self.drives[k].register(f.data)) if k >= 0 else []
-
-    def _sent(self, k: int, reply: bytes | None) -> list[bytes]:
-        """Return a drive's reply as frames on the bus, after whatever the injector does to it."""
-        if reply is None:
-            return []
-        can_id = int(self.drives[k].registers[codec.MST_ID])
-        fd = self.settings.fd
-        payloads = self.injector.reply(self.plant.scene_ns, k, reply)
-        return [frame.pack(can_id, p, fd=fd, brs=fd) for p in payloads]
+    def answer(self, came: Batch, replies: Batch, first: int = 0, clocked: bool = False) -> tuple[int, int]:
+        """Take a batch of frames from `first` on, see `Wire.answer`."""
+        return self.wire.answer(self.plant.scene_ns, came, replies, first, clocked)
 
     def advance(self) -> None:
         """Run drives and plant for one servo period."""
@@ -127,25 +100,28 @@ class Simulator:
 
     def step(self) -> None:
         """Run drives and plant for one physics step; the last one of a period closes it."""
-        plant = self.plant
-        self.injector.apply(plant.scene_ns, self.drives)
-        acts = [d.actuate(plant.step_ns) for d in self.drives]
-        plant.step([a.torque for a in acts], [a.drag for a in acts])
-        self.started = self.started or any(d.state is State.ENABLED for d in self.drives)
+        plant, bank = self.plant, self.bank
+        if not self.injector.quiet(plant.scene_ns):
+            self.injector.apply(plant.scene_ns, self.drives)
+        enabled = bank.actuate(plant.step_ns)
+        plant.step(bank.torque.tolist(), bank.drag.tolist())
+        self.started = self.started or enabled
         if self.started:
             plant.scene_ns += plant.step_ns
         self._sense()
         self._steps += 1
         if self._steps % plant.substeps == 0:
             plant.advance_world()
-            self.max_torque = [max(m, abs(d.torque)) for m, d in zip(self.max_torque, self.drives, strict=True)]
-            self.commanded.clear()
+            bank.close_period()
             self._truth = None
 
     def _sense(self) -> None:
-        q, qd = self.plant.q, self.plant.qd
+        q, qd, now = self.plant.q, self.plant.qd, self.plant.scene_ns
+        if self.injector.quiet(now):
+            self.bank.sense(q, qd)
+            return
         for k, drive in enumerate(self.drives):
-            drive.sense(*self.injector.encoder(self.plant.scene_ns, k, q[k], qd[k]))
+            drive.sense(*self.injector.encoder(now, k, q[k], qd[k]))
 
     def obstacles(self) -> list[ObstacleEdit]:
         """Return what a perfect camera reports now: every obstacle present, and those that have vanished as cleared."""
@@ -167,7 +143,7 @@ class Simulator:
             plant = self.plant
             tip, wxyz = plant.tip_pose()
             clearance, own = plant.clearances(), plant.self_clearance()
-            tau = np.array([d.torque for d in self.drives])
+            tau = self.bank.f[:, TORQUE].copy()
             self._truth = Truth(
                 self.time, np.array(plant.q), np.array(plant.qd), tau, tip, wxyz, clearance, own, len(plant.contacts)
             )

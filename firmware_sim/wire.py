@@ -1,0 +1,91 @@
+"""Raw frames of the bus to the drives of an arm and back, with whatever the injected faults do to them on their way.
+
+A batch goes through compiled code as far as it is of the common form and nothing is injected; what is not goes frame
+by frame through `Drive`'s own Python, in the same order.
+"""
+
+from firmware_sim import codec
+from firmware_sim.bank import Bank
+from firmware_sim.bank_kernels import AGAIN, ALL_READ, EVERYBODY, UNCOMMON
+from firmware_sim.batch import Batch
+from firmware_sim.cells import COMMANDED
+from firmware_sim.inject import Injector
+from rtctl.protocol import frame
+
+
+class Wire:
+    """Routes frames by their identifier; owns nothing."""
+
+    def __init__(self, bank: Bank, injector: Injector, fd: bool) -> None:
+        self.bank, self.injector, self.fd = bank, injector, fd
+        self.drives = bank.drives
+        self.by_id = {d.rating.motor: k for k, d in enumerate(self.drives)}
+
+    def answer(self, now: int, came: Batch, replies: Batch, first: int, clocked: bool) -> tuple[int, int]:
+        """Take the frames of a batch from `first` on, each answered at once; add the replies to another batch.
+
+        now: [ns] on the scenario's clock. clocked: stop before a second frame to a drive within a period (AGAIN), and
+        once every drive has had one (EVERYBODY). Returns the next frame, and why it stopped there: else ALL_READ.
+        """
+        at, quiet = first, self.injector.quiet(now)
+        while at < came.count:
+            if quiet:
+                at, why = self.bank.answer(came, replies, at, clocked)
+                if why != UNCOMMON:
+                    return at, why
+            raw = came.frame(at)
+            if clocked and self._repeats(raw):
+                return at, AGAIN
+            replies.extend(self.answer_one(now, raw))
+            at += 1
+            if clocked and self.bank.i[:, COMMANDED].all():
+                return at, EVERYBODY
+        return at, ALL_READ
+
+    def _repeats(self, raw: bytes) -> bool:
+        """Tell whether a frame commands a joint that has its command of this period already."""
+        try:
+            f = frame.unpack(raw)
+        except ValueError:
+            return False
+        k = self.by_id.get(f.can_id, -1)
+        return k >= 0 and bool(self.bank.i[k, COMMANDED]) and not (f.error or f.rtr or f.extended)
+
+    def answer_one(self, now: int, raw: bytes) -> list[bytes]:
+        """Take one frame; return the replies to it."""
+        try:
+            f = frame.unpack(raw)
+        except ValueError:
+            return []
+        if f.error or f.rtr or f.extended or f.fd != self.fd:
+            return []
+        if f.can_id == codec.REGISTER_ID:
+            return self._register(now, f.data)
+        k = self.by_id.get(f.can_id, -1)
+        if k < 0:
+            return []
+        self.bank.i[k, COMMANDED] = 1
+        data = self.injector.command(now, k, f.data)
+        return self._sent(now, k, self.drives[k].receive(data) if data is not None else None)
+
+    def _register(self, now: int, data: bytes) -> list[bytes]:
+        k = self.by_id.get(codec.decode_register(data).motor, -1) if len(data) >= 8 else -1
+        return self._sent(now, k, self.drives[k].register(data)) if k >= 0 else []
+
+    def _sent(self, now: int, k: int, reply: bytes | None) -> list[bytes]:
+        """Return a drive's reply as frames on the bus, after whatever the injector does to it."""
+        if reply is None:
+            return []
+        can_id = int(self.drives[k].registers[codec.MST_ID])
+        return [frame.pack(can_id, p, fd=self.fd, brs=self.fd) for p in self.injector.reply(now, k, reply)]
+
+
+def of_registers(raw: bytes) -> bool:
+    """Tell whether a frame is a register frame, which takes no time."""
+    if raw[:1] != b"\xff":
+        return False
+    try:
+        f = frame.unpack(raw)
+    except ValueError:
+        return False
+    return f.can_id == codec.REGISTER_ID and not (f.error or f.rtr or f.extended)
