@@ -10,13 +10,13 @@ import signal
 import sys
 import time
 import tomllib
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from firmware_sim.bank_kernels import ALL_READ
+from firmware_sim.batch import Batch
 from firmware_sim.bus import Bus, open_bus
 from firmware_sim.camera import Camera
-from firmware_sim.cells import COMMANDED
 from firmware_sim.codec import REGISTER_ID
 from firmware_sim.drive import NS
 from firmware_sim.inject import KINDS
@@ -40,6 +40,7 @@ class Loop:
 
     def __init__(self, simulator: Simulator, bus: Bus, report: Report, camera: Camera | None) -> None:
         self.simulator, self.bus, self.report, self.camera = simulator, bus, report, camera
+        self.came, self.replies = Batch(bus.capacity), Batch(2 * bus.capacity)  # an injected fault answers one twice
         self.stop = False
         self.frames = 0
         self.periods = 0
@@ -49,15 +50,19 @@ class Loop:
     def _on_signal(self, *_: object) -> None:
         self.stop = True
 
-    def answer(self, timeout: float) -> list[bytes]:
-        """Return the frames that came within `timeout` [s]."""
-        frames = self.bus.receive(timeout)
-        self.frames += len(frames)
-        return frames
+    def hear(self) -> None:
+        """Take the frames that have come."""
+        self.came.count = 0
+        self.bus.receive(self.came)
+        self.frames += self.came.count
+
+    def say(self) -> None:
+        """Send what the drives have answered."""
+        self.bus.send(self.replies)
+        self.replies.count = 0
 
     def observe(self, oracle: bool) -> None:
-        """Close one period for everybody who watches."""
-        self.periods += 1
+        """Tell everybody who watches how things are at the end of a period."""
         if oracle:
             self.report.observe()
         if self.camera is not None:
@@ -69,82 +74,90 @@ class Loop:
 
         A second command for a joint closes a cycle that others have missed: a lost frame must not stop time.
         """
-        simulator = self.simulator
+        simulator, came = self.simulator, self.came
         period = simulator.settings.period_ns / NS
         heard = time.monotonic()
         due = 0.0
         while not self.stop:
             now = time.monotonic()
             quiet = now - heard >= QUIET_S
-            frames = self.answer(max(due - now, 0.0) if quiet else QUIET_S - (now - heard))
-            if frames:
+            self.bus.wait(max(due - now, 0.0) if quiet else QUIET_S - (now - heard))
+            self.hear()
+            if came.count:
                 heard = time.monotonic()
                 due = 0.0
             elif quiet and time.monotonic() >= due:
                 due = max(due, time.monotonic() - QUIET_S) + (period if self._awake() else ASLEEP_S)
                 self._advance()
-            replies: list[bytes] = []
-            for raw in frames:
-                if simulator.repeats(raw):
-                    replies = self._advance(replies)
-                replies += simulator.answer(raw)[0]
-                if simulator.bank.i[:, COMMANDED].all():
-                    replies = self._advance(replies)
-            self.bus.send(replies)
+            at, why = simulator.answer(came, self.replies, 0, clocked=True)
+            while why != ALL_READ:
+                self._advance()
+                at, why = simulator.answer(came, self.replies, at, clocked=True)
+            self.say()
 
     def _awake(self) -> bool:
         """Tell whether a joint may move, or a trip still waits to see it at rest."""
         return any(not d.brake or (d.trips and d.trips[-1].rest < 0) for d in self.simulator.drives)
 
-    def _advance(self, replies: Sequence[bytes] = ()) -> list[bytes]:
+    def _advance(self) -> None:
         """Send what waits, so that the controller can think meanwhile, then run one period."""
-        self.bus.send(replies)
+        self.say()
         self.simulator.advance()
+        self.periods += 1
         self.observe(oracle=True)
-        return []
 
     def realtime(self) -> None:
         """Run the physics on an absolute grid of its own; answer each frame when it comes, with the state of then.
 
-        Lost time is made up for, but by at most SLIP_NS: in a longer rush the drives' time would pass so much faster
-        than the controller's that a moment of its silence would trip their watchdogs. The rest is given up and counted.
+        Steps are taken when a frame comes, and a period late at most where none does: who is spoken to every period is
+        woken once in it. Lost time is made up for, but by at most SLIP_NS: in a longer rush the drives' time would pass
+        so much faster than the controller's that a moment of its silence would trip their watchdogs. The rest is given
+        up and counted. Who watches comes after the answers.
         """
-        simulator, clock = self.simulator, Clock(self.simulator.plant.step_ns)
+        simulator, plant = self.simulator, self.simulator.plant
+        clock = Clock(plant.step_ns, patience=plant.substeps * plant.step_ns)
         started = simulator.started
+        looked = 0
         while not self.stop:
-            frames = self.answer(clock.left())
+            self.bus.wait(clock.left())
+            before = self.periods
             for _ in range(CATCH_UP):
                 if not clock.due():
                     break
                 simulator.step()
-                if clock.steps % simulator.plant.substeps == 0:
-                    self.observe(oracle=self.periods % ORACLE_PERIODS == 0)
-            self.bus.send([reply for raw in frames for reply in simulator.answer(raw)[0]])
+                self.periods += clock.steps % plant.substeps == 0
+            self.hear()  # now: a cycle's frames come one after the other, and meanwhile they all have
+            simulator.answer(self.came, self.replies)
+            self.say()
             if simulator.started and not started:  # what was late before does not matter any more
                 started = True
                 clock.forget()
-            self.report.extra |= clock.account()
+            if self.periods > before:
+                self.report.extra |= clock.account()
+                oracle = self.periods >= looked
+                looked = self.periods + ORACLE_PERIODS if oracle else looked
+                self.observe(oracle)
 
 
 class Clock:
     """The grid of the physics steps on the wall clock."""
 
-    def __init__(self, step: int) -> None:
-        """`step` [ns] is the grid's period."""
-        self.step = step
+    def __init__(self, step: int, patience: int = 0) -> None:
+        """`step` [ns] is the grid's period, `patience` [ns] by how much later than on time a step may be taken."""
+        self.step, self.patience = step, patience
         self.next = time.monotonic_ns() + step
         self.steps = self.slipped = self.latest = self.before = 0
 
     def left(self) -> float:
-        """Return the time [s] until the next step."""
-        return max(self.next - time.monotonic_ns(), 0) / NS
+        """Return the time [s] until the next step must be taken."""
+        return max(self.next + self.patience - time.monotonic_ns(), 0) / NS
 
     def due(self) -> bool:
         """Tell whether it is time for the next step, and if so count it as done."""
         late = time.monotonic_ns() - self.next
         if late < 0:
             return False
-        self.latest = max(self.latest, late)
+        self.latest = max(self.latest, late - self.patience)
         if late > SLIP_NS:
             lost = late // self.step
             self.slipped += lost

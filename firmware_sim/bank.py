@@ -133,7 +133,7 @@ class Bank:
     def answer(self, came: Batch, replies: Batch, first: int, clocked: bool) -> tuple[int, int]:
         """Take the frames of a batch from `first` on, and add the replies to another.
 
-        Returns the next frame and why it stopped there, see `bank_kernels.answer`; `clocked` lets it stop for the clock.
+        Returns the next frame and why it stopped there, see `bank_kernels.answer`; `clocked`: for the clock, too.
         """
         before = replies.count
         at, replies.count, why = bank_kernels.answer(

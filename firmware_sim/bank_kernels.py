@@ -1,8 +1,8 @@
 """`firmware_sim.drive`, compiled: the same rules for all drives of an arm at once, over rows of numbers.
 
-Each function mirrors the method of `Drive` that it names, to the bit; tests hold it to that. A row `f` holds one drive's
-floats, `i` its integers, at the columns of `firmware_sim.cells`. Registers, and frames that are not of the link's own
-form, are left to the drive in Python.
+Each function mirrors the method of `Drive` that it names, to the bit; tests hold it to that. A row `f` holds one
+drive's floats, `i` its integers, at the columns of `firmware_sim.cells`. Registers, and frames that are not of the
+link's own form, are left to the drive in Python.
 """
 
 import math
@@ -74,7 +74,7 @@ def _limited(f: F64, i: I64, dt: float) -> float:
 def _actuate(f: F64, i: I64, dt_ns: int) -> float:
     """Advance one drive by dt; return the drag [Nm]. The torque is driven where the drag is 0."""
     dt = dt_ns / d.NS
-    if i[c.STATE] == ENABLED and 0 < i[c.TIMEOUT_NS] and i[c.TIMEOUT_NS] <= i[c.SILENCE_NS]:
+    if i[c.STATE] == ENABLED and i[c.TIMEOUT_NS] > 0 and i[c.TIMEOUT_NS] <= i[c.SILENCE_NS]:
         _trip(f, i, SILENCE)
         i[c.WATCHDOG_TRIPPED] = 1
     if abs(f[c.QD]) > f[c.OVER_SPEED]:
@@ -172,7 +172,7 @@ def _quantise(x: float, bound: float, bits: int) -> int:
     if not math.isfinite(x):
         x = 0.0
     x = min(max(x, -bound), bound)
-    return int(math.floor((x + bound) * top / (2.0 * bound) + 0.5))
+    return math.floor((x + bound) * top / (2.0 * bound) + 0.5)
 
 
 @kernel
@@ -262,9 +262,7 @@ def _act(f: F64, i: I64, special: int) -> None:
 
 
 @kernel
-def answer(
-    F: F64, I: I64, form: I64, raw: U8, lengths: I64, first: int, out: U8, replies: int
-) -> tuple[int, int, int]:
+def answer(F: F64, I: I64, form: I64, raw: U8, lengths: I64, first: int, out: U8, replies: int) -> tuple[int, int, int]:
     """Let the drives take raw frames from `first` on and write their replies as raw frames, from `replies` on.
 
     raw: (m, w) a frame a row, `lengths` (m,) its bytes. out: (m + 1, size), a reply a row.

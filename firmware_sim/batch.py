@@ -1,12 +1,71 @@
-"""A cycle's raw frames in one block of memory: filled by a bus or by the drives, read by the other, never reallocated."""
+"""A cycle's raw frames in one block of memory, and the system calls that move them all at once.
 
-from collections.abc import Iterable
+The block is filled by a bus or by the drives and read by the other; nothing is allocated while it goes round. Linux
+takes and gives many packets of a socket in one call (recvmmsg, sendmmsg), each row of the block being one packet.
+"""
+
+import ctypes
+import errno
+import socket
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 ROOM = 80  # bytes a frame: above the 72 of the longest, so that an oversize packet shows its length
 CAPACITY = 64  # frames that are taken at once: a flooding peer must not starve the clock
+SIZES = frozenset((16, 72))  # bytes of a classic and an FD frame
+NOW = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+
+
+class _Iovec(ctypes.Structure):
+    """`struct iovec`."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
+
+
+class _Msghdr(ctypes.Structure):
+    """`struct msghdr`."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_size", ctypes.c_uint32),
+        ("iov", ctypes.c_void_p),
+        ("iov_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_size", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Mmsghdr(ctypes.Structure):
+    """`struct mmsghdr`."""
+
+    _fields_ = (("header", _Msghdr), ("length", ctypes.c_uint))
+
+
+_STRIDE = ctypes.sizeof(_Mmsghdr)
+_libc = ctypes.PyDLL(None, use_errno=True)  # calls that never block need not let other threads in
+_libc.recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+_libc.sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
+
+
+class _Vector:
+    """Message headers whose packets are the rows of a block."""
+
+    def __init__(self, data: bytearray, capacity: int) -> None:
+        self._iovecs = (_Iovec * capacity)()
+        self._headers = (_Mmsghdr * capacity)()
+        start = ctypes.addressof(ctypes.c_char.from_buffer(data))
+        for k in range(capacity):
+            self._iovecs[k].base, self._iovecs[k].size = start + k * ROOM, ROOM
+            self._headers[k].header.iov = ctypes.addressof(self._iovecs[k])
+            self._headers[k].header.iov_count = 1
+        self.address = ctypes.addressof(self._headers)
+        words = np.frombuffer(memoryview(self._headers).cast("B"), dtype=np.uint32).reshape(capacity, -1)
+        self.lengths = words[:, _Mmsghdr.length.offset // 4]  # of what came
+        sizes = np.frombuffer(memoryview(self._iovecs).cast("B"), dtype=np.uint64).reshape(capacity, -1)
+        self.sizes = sizes[:, 1]  # of what goes
 
 
 class Batch:
@@ -18,20 +77,23 @@ class Batch:
         self.raw: NDArray[np.uint8] = np.frombuffer(self.data, dtype=np.uint8).reshape(capacity, ROOM)
         self.lengths: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
         self.count = 0
+        self._sizes: list[int] = []  # of the first frames, as `extend` has left them in `lengths`
+        self._coming, self._going = _Vector(self.data, capacity), _Vector(self.data, capacity)
 
-    def extend(self, frames: Iterable[bytes]) -> None:
+    def extend(self, frames: Sequence[bytes]) -> None:
         """Add frames; what has no room is left out."""
-        data, lengths, k = self.data, self.lengths, self.count
-        for raw in frames:
-            if k == self.capacity:
-                break
-            at, size = k * ROOM, len(raw)
-            if size > ROOM:
-                raw = raw[:ROOM]
-            data[at : at + len(raw)] = raw
-            lengths[k] = size
-            k += 1
-        self.count = k
+        start = self.count
+        frames = frames[: self.capacity - start]
+        sizes = [len(raw) for raw in frames]
+        if SIZES.issuperset(sizes):
+            rows = [raw.ljust(ROOM) for raw in frames]
+        else:
+            rows = [raw[:ROOM].ljust(ROOM) for raw in frames]
+        self.count = end = start + len(frames)
+        self.data[start * ROOM : end * ROOM] = b"".join(rows)
+        if start or sizes != self._sizes:  # a cycle is as the one before
+            self.lengths[start:end] = sizes
+            self._sizes = [] if start else sizes
 
     def frame(self, k: int) -> bytes:
         """Return one frame."""
@@ -39,6 +101,57 @@ class Batch:
 
     def frames(self) -> list[bytes]:
         """Return all of them."""
-        data = self.data
+        data = bytes(self.data[: self.count * ROOM])
         ends = self.lengths[: self.count].tolist()
-        return [bytes(data[k * ROOM : k * ROOM + size]) for k, size in enumerate(ends)]
+        return [data[k * ROOM : k * ROOM + size] for k, size in enumerate(ends)]
+
+    def take(self, fd: int, limit: int = CAPACITY) -> bool:
+        """Add the frames that wait on a socket, at most `limit`; return whether its connection stands.
+
+        Packets that are no frames are left out. Raises OSError, but for a socket on which nothing waits.
+        """
+        start = self.count
+        room = min(limit, self.capacity - start)
+        came = _libc.recvmmsg(fd, self._coming.address + start * _STRIDE, room, NOW, None)
+        if came < 0:
+            code = ctypes.get_errno()
+            if code in (errno.EAGAIN, errno.EINTR):
+                return True
+            raise OSError(code, "recvmmsg")
+        self._sizes = []
+        self.lengths[start : start + came] = self._coming.lengths[start : start + came]
+        sizes = self.lengths[start : start + came].tolist()
+        if SIZES.issuperset(sizes):
+            self.count = start + came
+            return True
+        return self._sift(start, sizes)
+
+    def _sift(self, start: int, sizes: list[int]) -> bool:
+        """Keep what is a frame, up to the end of the connection, which is an empty packet."""
+        ended = 0 in sizes
+        for k, size in enumerate(sizes[: sizes.index(0)] if ended else sizes):
+            if size in SIZES:
+                self.raw[self.count], self.lengths[self.count] = self.raw[start + k], size
+                self.count += 1
+        return not ended
+
+    def give(self, fd: int, first: int = 0) -> int:
+        """Send the frames from `first` on through a socket; return how many were lost. Raises OSError.
+
+        A full socket loses all that is left, a full transmit queue the frame that it does not take.
+        """
+        going, at, lost = self._going, first, 0
+        going.sizes[first : self.count] = self.lengths[first : self.count]
+        while at < self.count:
+            went = _libc.sendmmsg(fd, going.address + at * _STRIDE, self.count - at, NOW)
+            if went >= 0:
+                at += went
+                continue
+            code = ctypes.get_errno()
+            if code == errno.EAGAIN:
+                return lost + self.count - at
+            if code == errno.ENOBUFS:
+                at, lost = at + 1, lost + 1
+            elif code != errno.EINTR:
+                raise OSError(code, "sendmmsg")
+        return lost

@@ -1,7 +1,7 @@
 """The bus the drives sit on: a hub of Unix sockets that needs no kernel support, or SocketCAN.
 
 Both carry whole `struct can_frame` and `struct canfd_frame`, one a packet; both send or drop, and never block but in
-`receive`.
+`wait`. The frames of a cycle come and go in one system call a peer, see `firmware_sim.batch`.
 """
 
 import errno
@@ -14,11 +14,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
+from firmware_sim.batch import CAPACITY, Batch
 from firmware_sim.settings import SettingsError
 
-FRAME_MAX = 80  # above the 72 bytes of the longest frame
 PEERS_MAX = 16
-BATCH = 64  # frames of one peer in one go: a flooding peer must not starve the clock
 REOPEN_S = 1.0
 
 
@@ -27,10 +26,13 @@ class Bus(Protocol):
 
     name: str
     dropped: int
+    capacity: int  # frames that can come at once
 
-    def receive(self, timeout: float) -> list[bytes]: ...  # everything that waits, after at most `timeout` [s]
+    def wait(self, timeout: float) -> None: ...  # until a frame comes, at most `timeout` [s]
 
-    def send(self, frames: Iterable[bytes]) -> None: ...
+    def receive(self, into: Batch) -> None: ...  # adds what waits where something did at the end of `wait`
+
+    def send(self, frames: Batch) -> None: ...
 
     def close(self) -> None: ...
 
@@ -53,6 +55,8 @@ def open_bus(interface: str, channel: str, ids: Iterable[int]) -> Bus:
 class Hub:
     """Listens at a path; every frame of a peer goes to all other peers, and to the drives."""
 
+    capacity = PEERS_MAX * CAPACITY
+
     def __init__(self, path: str) -> None:
         self.name, self.dropped = path, 0
         self._claim(path)
@@ -68,6 +72,8 @@ class Hub:
         self._listener.listen(PEERS_MAX)
         self._inode = os.stat(path).st_ino
         self._peers: dict[int, socket.socket] = {}
+        self._sources = [self._listener.fileno()]
+        self._ready: list[int] = []
 
     @staticmethod
     def _claim(path: str) -> None:
@@ -81,18 +87,18 @@ class Hub:
                 raise SettingsError(f"{path}: this bus is served already")
         os.unlink(path)
 
-    def receive(self, timeout: float) -> list[bytes]:
-        """Return what came from all peers within `timeout` [s], each one's frames in order; the others get it too.
+    def wait(self, timeout: float) -> None:
+        """Wait for frames, at most `timeout` [s]: by `select`, as Python's `epoll` rounds up to whole milliseconds."""
+        self._ready = select.select(self._sources, (), (), timeout)[0]
 
-        `select`, because Python's `epoll` rounds its time-out up to whole milliseconds.
-        """
-        frames: list[bytes] = []
-        for source in select.select([self._listener, *self._peers.values()], [], [], timeout)[0]:
-            if source is self._listener:
+    def receive(self, into: Batch) -> None:
+        """Add what waits from those peers that had something, each one's frames in order; the others get it too."""
+        for fd in self._ready:
+            if fd == self._sources[0]:
                 self._accept()
-            elif source.fileno() in self._peers:  # forwarding may have shown that it is gone
-                frames += self._drain(source.fileno())
-        return frames
+            elif fd in self._peers:  # forwarding may have shown that it is gone
+                self._drain(fd, into)
+        self._ready = []
 
     def _accept(self) -> None:
         try:
@@ -104,45 +110,36 @@ class Hub:
             return
         peer.setblocking(False)
         self._peers[peer.fileno()] = peer
+        self._sources.append(peer.fileno())
 
-    def _drain(self, fd: int) -> list[bytes]:
-        frames: list[bytes] = []
-        peer = self._peers[fd]
-        for _ in range(BATCH):
-            try:
-                raw = peer.recv(FRAME_MAX)
-            except BlockingIOError:
-                break
-            except OSError:
-                raw = b""
-            if not raw:
-                self._leave(fd)
-                break
-            if len(raw) in (16, 72):
-                frames.append(raw)
-        if len(self._peers) > 1:
-            self._spread(frames, fd)
-        return frames
+    def _drain(self, fd: int, into: Batch) -> None:
+        first = into.count
+        try:
+            stands = into.take(fd)
+        except OSError:
+            stands = False
+        if not stands:
+            self._leave(fd)
+        if len(self._peers) > 1 and into.count > first:
+            self._spread(into, first, fd)
 
     def _leave(self, fd: int) -> None:
+        self._sources.remove(fd)
         self._peers.pop(fd).close()
 
-    def send(self, frames: Iterable[bytes]) -> None:
+    def send(self, frames: Batch) -> None:
         """Send frames to every peer; one that does not read loses them."""
-        self._spread(list(frames), -1)
+        if frames.count:
+            self._spread(frames, 0, -1)
 
-    def _spread(self, frames: list[bytes], source: int) -> None:
-        for fd, peer in list(self._peers.items()):
+    def _spread(self, frames: Batch, first: int, source: int) -> None:
+        for fd in self._sources[1:]:
             if fd == source:
                 continue
-            for raw in frames:
-                try:
-                    peer.send(raw)
-                except BlockingIOError:
-                    self.dropped += 1
-                except OSError:
-                    self._leave(fd)
-                    break
+            try:
+                self.dropped += frames.give(fd, first)
+            except OSError:
+                self._leave(fd)
 
     def close(self) -> None:
         """Hang up and take the path away, unless somebody else has taken it over."""
@@ -159,10 +156,13 @@ class Hub:
 class SocketCan:
     """A raw CAN socket; opened anew each second after its interface went away."""
 
+    capacity = CAPACITY
+
     def __init__(self, channel: str, ids: Iterable[int]) -> None:
         self.name, self.dropped = channel, 0
         self._ids = tuple(ids)
         self._retry = 0.0
+        self._ready = False
         try:
             self._socket: socket.socket | None = self._open()
         except OSError as error:
@@ -184,22 +184,22 @@ class SocketCan:
         sock.setblocking(False)
         return sock
 
-    def receive(self, timeout: float) -> list[bytes]:
-        """Return what came within `timeout` [s]."""
+    def wait(self, timeout: float) -> None:
+        """Wait for frames, at most `timeout` [s]."""
         if self._socket is None:
             self._reopen(timeout)
-            return []
-        frames: list[bytes] = []
+        else:
+            self._ready = bool(select.select([self._socket], (), (), timeout)[0])
+
+    def receive(self, into: Batch) -> None:
+        """Add what waits, if something did."""
+        if not self._ready or self._socket is None:
+            return
+        self._ready = False
         try:
-            if not select.select([self._socket], [], [], timeout)[0]:
-                return []
-            while len(frames) < BATCH:
-                frames.append(self._socket.recv(FRAME_MAX))
-        except BlockingIOError:
-            pass
+            into.take(self._socket.fileno())
         except OSError as error:
             self._fail(error)
-        return frames
 
     def _fail(self, error: OSError) -> None:
         """Give up a socket whose interface is gone; one that is merely down comes back by itself."""
@@ -216,17 +216,16 @@ class SocketCan:
             except OSError:
                 self._socket = None
 
-    def send(self, frames: Iterable[bytes]) -> None:
+    def send(self, frames: Batch) -> None:
         """Send frames, or drop what the interface does not take."""
-        for raw in frames:
-            if self._socket is None:
-                self.dropped += 1
-                continue
-            try:
-                self._socket.send(raw)
-            except OSError as error:
-                self.dropped += 1
-                self._fail(error)
+        if self._socket is None:
+            self.dropped += frames.count
+            return
+        try:
+            self.dropped += frames.give(self._socket.fileno())
+        except OSError as error:
+            self.dropped += frames.count
+            self._fail(error)
 
     def close(self) -> None:
         """Close the socket."""

@@ -8,12 +8,13 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
-from numba import config, njit
+import numba
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_settings: Any = numba.config  # whose attributes come from the environment
 _SOURCES = ("bank_kernels", "cells", "codec", "drive", "kernel")
 
 
@@ -34,10 +35,9 @@ _FOLDER = str(_folder())
 
 def kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile a function that is also valid plain Python; sums keep their order, so equal inputs give equal bits."""
-    base = config.CACHE_DIR
-    config.CACHE_DIR = _FOLDER
+    base, _settings.CACHE_DIR = _settings.CACHE_DIR, _FOLDER
     try:
-        compiled: Callable[_P, _R] = njit(cache=True, fastmath=False, error_model="numpy")(function)
+        compiled: Callable[_P, _R] = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
     finally:
-        config.CACHE_DIR = base
+        _settings.CACHE_DIR = base
     return compiled

@@ -19,7 +19,7 @@ from firmware_sim.wire import Wire
 from rtctl.protocol import frame
 
 HALF_MS = 500_000
-IDS = (3, 4, 9)
+IDS = (3, 4, 0x109)
 BROADCAST = 0x7FF
 
 
@@ -28,7 +28,7 @@ def ratings(e2e: bool) -> list[Rating]:
     return [
         Rating(3, codec.Scale(12.5, 45.0, 54.0), 40.0, 1000.0, 16.0, 1_000_000, 400, 4, e2e),
         Rating(4, codec.Scale(12.5, 30.0, 10.0), 7.0, 300.0, 2.0, 2_000_000, 40, 4, e2e, 1_000_000),
-        Rating(9, codec.Scale(6.25, 8.0, 28.0), 90.0, 5000.0, 5.0, 250_000, 0, 4, e2e, 0),
+        Rating(0x109, codec.Scale(6.25, 8.0, 28.0), 90.0, 5000.0, 5.0, 250_000, 0, 4, e2e, 0),
     ]
 
 
@@ -44,6 +44,11 @@ class Said(NamedTuple):
 
 
 torque = st.integers(0, 4095).map(lambda t: (0x8000 << 48 | 0x800 << 36 | t).to_bytes(8, "big"))
+servo = st.builds(  # gains that leave the torque within its bounds, at small angles
+    lambda p, v, kp, kd, t: (p << 48 | v << 36 | kp << 24 | kd << 12 | t).to_bytes(8, "big"),
+    st.integers(0x7F00, 0x80FF), st.integers(0x700, 0x8FF), st.integers(0, 100), st.integers(0, 4095),
+    st.integers(0x780, 0x880),
+)  # fmt: skip
 special = st.integers(0xFA, 0xFF).map(lambda code: b"\xff" * 7 + bytes((code,)))
 likely = st.sampled_from([codec.SPECIAL_HEAD + bytes((code,)) for code in (codec.ENABLE, codec.CLEAR, codec.DISABLE)])
 number = st.sampled_from((7, 8, 9, 10, 21, 22, 23, 35, 99))
@@ -60,13 +65,16 @@ harm = st.sampled_from(
     ("none",) * 20 + ("flip", "short", "empty", "other size", "rtr", "extended", "error", "length", "junk")
 )
 ahead = st.sampled_from((1,) * 12 + (0, 2, -1, 100, 127, 128, 200))
-commands = st.one_of(torque, torque, torque, likely, special, st.binary(min_size=8, max_size=8))
+commands = st.one_of(torque, torque, servo, servo, likely, special, st.binary(min_size=8, max_size=8))
 told = st.builds(Said, st.sampled_from((*IDS, 5)), commands, ahead, st.sampled_from((1, 1, 1, 0)), harm, st.integers(0))
 asked = st.builds(Said, st.just(BROADCAST), register, ahead, st.just(0), harm, st.integers(0))
 traffic = st.lists(st.one_of(told, told, told, told, asked), max_size=12)
 ordinary = commands.map(lambda data: [Said(i, data, 1, 1, "none", 0) for i in IDS])  # a cycle as a controller sends it
 motion = st.one_of(
-    st.floats(-3.0, 3.0), st.floats(-40.0, 40.0), st.sampled_from((0.0, -0.0, math.nan, math.inf, -1e300, 5e-324))
+    st.floats(-0.1, 0.1),
+    st.floats(-3.0, 3.0),
+    st.floats(-40.0, 40.0),
+    st.sampled_from((0.0, -0.0, math.nan, math.inf, -1e300, 5e-324)),
 )
 
 
@@ -87,7 +95,7 @@ class Twins(RuleBasedStateMachine):
         self.wire = Wire(self.bank, Injector([]), fd)
         self.drives = [Drive(r) for r in ratings(self.e2e)]
         self.commanded: set[int] = set()
-        self.counters = {i: 0 for i in (*IDS, 5, BROADCAST)}
+        self.counters = dict.fromkeys((*IDS, 5, BROADCAST), 0)
         self.largest = [0.0] * 3
 
     # ---- what the wire carries
@@ -225,6 +233,20 @@ class Twins(RuleBasedStateMachine):
     def weaken(self, k: int, strength: float) -> None:
         for drive in (self.bank.drives[k], self.drives[k]):
             drive.strength = strength
+
+    @rule(k=st.integers(0, 2), qd=st.sampled_from((0.05, 0.15, 1.0)), steps=st.integers(1, 12))
+    def fall(self, k: int, qd: float, steps: int) -> None:
+        """A drive lets its brake go, trips, and its joint goes on to move, up to the time when the brake closes."""
+        for special in (codec.CLEAR, codec.ENABLE):
+            self.hear([self.raw(Said(IDS[k], b"\xff" * 7 + bytes((special,)), 1, 0, "none", 0))], False)
+        self.hear(
+            [self.raw(Said(IDS[k], (0x8000 << 48 | 0x800 << 36 | 0x800).to_bytes(8, "big"), 1, 1, "none", 0))], False
+        )
+        self.sense([0.0] * 3, [qd] * 3)
+        self.act(HALF_MS)
+        self.pass_time(100_000_000, 1)
+        self.trip(k, 0xA)
+        self.pass_time(100_000_000, steps)
 
     @rule(k=st.integers(0, 2))
     def reboot(self, k: int) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from firmware_sim.batch import Batch
 from firmware_sim.bus import Hub
 from firmware_sim.camera import Camera
 from firmware_sim.inject import KINDS, parse
@@ -498,11 +499,26 @@ def test_second_simulator_on_a_bus_and_a_bad_file_are_refused(tmp_path: Path) ->
     process.end()
 
 
+def look(bus: Hub, timeout: float = 0.1) -> list[bytes]:
+    """Return the frames that come to the hub in one look."""
+    batch = Batch(bus.capacity)
+    bus.wait(timeout)
+    bus.receive(batch)
+    return batch.frames()
+
+
+def send(bus: Hub, *frames: bytes) -> None:
+    """Send frames from the hub."""
+    batch = Batch()
+    batch.extend(frames)
+    bus.send(batch)
+
+
 def drain(bus: Hub, wanted: int) -> list[bytes]:
     """Return `wanted` frames from the hub, however many looks it takes."""
     frames: list[bytes] = []
     for _ in range(50):
-        frames += bus.receive(0.1)
+        frames += look(bus)
         if len(frames) >= wanted:
             break
     return frames
@@ -512,7 +528,7 @@ def test_hub_forwards_like_a_bus_and_survives_its_peers(tmp_path: Path) -> None:
     hub = Hub(str(tmp_path / "bus"))
     a, b, deaf = (connect(tmp_path) for _ in range(3))
     for _ in range(3):
-        hub.receive(0.1)
+        look(hub)
     one, two = frame.pack(1, b"one"), frame.pack(2, b"two", fd=True)
     a.send(one)
     a.send(two)
@@ -522,20 +538,20 @@ def test_hub_forwards_like_a_bus_and_survives_its_peers(tmp_path: Path) -> None:
     a.setblocking(False)
     with pytest.raises(BlockingIOError):
         a.recv(80)  # nobody hears himself
-    hub.send([two])
+    send(hub, two)
     assert a.recv(80) == two
     for _ in range(1000):
-        hub.send([one])  # a peer that does not read loses frames, nobody waits for it
+        send(hub, one)  # a peer that does not read loses frames, nobody waits for it
         a.recv(80)
         b.recv(80)
     assert hub.dropped > 0
     deaf.close()
     a.send(one)
     assert drain(hub, 1) == [one]
-    hub.send([two])
+    send(hub, two)
     a.close()
     b.close()
-    hub.receive(0.1)
+    look(hub)
     hub.close()
     assert not (tmp_path / "bus").exists()
 
@@ -544,13 +560,13 @@ def test_a_peer_that_dies_while_frames_are_forwarded_to_it_is_let_go(tmp_path: P
     hub = Hub(str(tmp_path / "bus"))
     with connect(tmp_path) as a, connect(tmp_path) as b:
         for _ in range(2):
-            hub.receive(0.1)
+            look(hub)
         a.send(frame.pack(1, b"one"))
         b.send(frame.pack(2, b"two"))
         b.close()
         for _ in range(3):
-            hub.receive(0.01)
-        hub.send([frame.pack(3, b"three")])
+            look(hub, 0.01)
+        send(hub, frame.pack(3, b"three"))
         assert a.recv(80)
     hub.close()
 
