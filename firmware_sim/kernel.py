@@ -15,7 +15,7 @@ import numba
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 _settings: Any = numba.config  # whose attributes come from the environment
-_SOURCES = ("bank_kernels", "cells", "codec", "drive", "kernel")
+_SOURCES = ("bank_kernels", "cells", "codec", "drive", "kernel", "nearness")
 
 
 def _folder() -> Path:

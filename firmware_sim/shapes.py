@@ -23,6 +23,7 @@ SIDES = 96  # of the polygon that stands for a circle: sagitta 0.05 % of the rad
 THIN = 1e-4  # [m] radius of a point or a segment without thickness
 SLAB = 20.0  # [m] half size of the box that stands for a half space
 HULL_TOLERANCE = 0.012
+REST = (0.0, 0.0, 0.0)  # [m/s]
 
 
 class Shape(NamedTuple):
@@ -58,6 +59,15 @@ class MeshFile(NamedTuple):
     size: F64  # (3,) [m] of the box about its own origin that holds it
 
 
+class Leg(NamedTuple):
+    """A stretch of an obstacle's way at constant velocity, in plain numbers."""
+
+    begins: float  # [s]
+    ends: float
+    start: tuple[float, float, float]  # [m]
+    velocity: tuple[float, float, float]  # [m/s]
+
+
 class Solid(NamedTuple):
     """One obstacle of a scenario: its own keys, and what follows from them."""
 
@@ -71,6 +81,7 @@ class Solid(NamedTuple):
     vertices: F64  # (k, 3) of the hull, (0, 3) for pybullet's own shapes
     still: bool  # never moves
     group: str  # the union it is a part of, "" for none
+    legs: tuple[Leg, ...]  # where it is at a time, without gaps
     mesh: MeshFile | None = None
     key: str = ""  # of the mesh, as the controller knows it
     scan: Scan | None = None
@@ -103,6 +114,7 @@ def solid(spec: dict[str, Any], settings: Settings) -> Solid:
         vertices=vertices,
         still=not spec.get("waypoints") and not any((*spec.get("velocity_m_s", ()), *spec.get("omega_rad_s", ()))),
         group="" if spec.get("combine") == "sum" else spec.get("group", ""),
+        legs=_legs(spec),
         mesh=mesh,
         key=(spec.get("mesh") or "@" + spec["name"]) if mesh else "",
         scan=scan,
@@ -179,25 +191,47 @@ def _mesh(spec: dict[str, Any], settings: Settings) -> MeshFile:
     return MeshFile(path, scale, bool(table.get("hull", False)), 2.0 * scale * np.abs(vertices).max(axis=0))
 
 
-def position_at(obstacle: Solid, t: float) -> tuple[F64, F64]:
-    """Return position [m] and velocity [m/s] at time t [s]: constant velocity from `appears_s`, or along waypoints."""
-    waypoints = obstacle.spec.get("waypoints")
+def _legs(spec: dict[str, Any]) -> tuple[Leg, ...]:
+    """Return an obstacle's way: at constant velocity from `appears_s`, or along waypoints and at rest at their ends."""
+    waypoints = spec.get("waypoints")
     if not waypoints:
-        velocity = np.array(obstacle.spec.get("velocity_m_s", (0.0, 0.0, 0.0)), dtype=np.float64)
-        return np.array(obstacle.spec["position_m"]) + velocity * max(t - obstacle.appears, 0.0), velocity
-    for (t0, *a), (t1, *b) in pairwise(waypoints):
-        if t0 <= t < t1:
-            velocity = (np.array(b) - np.array(a)) / (t1 - t0)
-            return np.array(a) + velocity * (t - t0), velocity
-    rest = waypoints[0] if t < waypoints[0][0] else waypoints[-1]
-    return np.array(rest[1:], dtype=np.float64), np.zeros(3)
+        x, y, z = (float(v) + 0.0 for v in spec["position_m"])  # no negative zero
+        vx, vy, vz = map(float, spec.get("velocity_m_s", (0.0, 0.0, 0.0)))
+        at = float(spec.get("appears_s", 0.0))
+        return (Leg(-math.inf, at, (x, y, z), REST), Leg(at, math.inf, (x, y, z), (vx, vy, vz)))
+    points = [(float(t), (float(x), float(y), float(z))) for t, x, y, z in waypoints]
+    legs = [Leg(-math.inf, points[0][0], points[0][1], REST)]
+    for (t0, a), (t1, b) in pairwise(points):
+        if t1 > t0:
+            vx, vy, vz = ((v - u) / (t1 - t0) for u, v in zip(a, b, strict=True))
+            legs.append(Leg(t0, t1, (a[0] + 0.0, a[1] + 0.0, a[2] + 0.0), (vx, vy, vz)))
+    legs.append(Leg(points[-1][0], math.inf, points[-1][1], REST))
+    return tuple(legs)
+
+
+def leg_at(obstacle: Solid, t: float) -> Leg:
+    """Return the leg that an obstacle is on at time t [s]."""
+    for leg in obstacle.legs:
+        if leg.begins <= t < leg.ends:
+            return leg
+    return obstacle.legs[-1]
+
+
+def place_at(leg: Leg, t: float) -> tuple[float, float, float]:
+    """Return the position [m] at time t [s] of its leg."""
+    (x, y, z), (vx, vy, vz) = leg.start, leg.velocity
+    if leg.velocity == REST:
+        return leg.start
+    past = t - leg.begins
+    return (x + vx * past, y + vy * past, z + vz * past)
 
 
 def shape_at(obstacle: Solid, t: float) -> Shape | None:
     """Return the obstacle as it is at time t [s], None while it is not there."""
     if not obstacle.appears <= t < obstacle.vanishes:
         return None
-    position, velocity = position_at(obstacle, t)
+    leg = leg_at(obstacle, t)
+    position, velocity = np.array(place_at(leg, t)), np.array(leg.velocity)
     omega = np.array(obstacle.spec.get("omega_rad_s", (0.0, 0.0, 0.0)), dtype=np.float64)
     angle = float(np.linalg.norm(omega)) * (t - obstacle.appears)
     o = obstacle

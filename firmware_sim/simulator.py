@@ -60,6 +60,7 @@ class Simulator:
         self.wire = Wire(self.bank, injector, settings.fd)
         self.plant = Plant(settings, start_q, obstacles)
         self.started = not wait
+        self.exact = True  # whether every truth tells exact clearances; else their least over the run alone are exact
         self._came, self._replies = Batch(), Batch(REPLIES)
         self._steps = 0
         self._shown: set[str] = set()
@@ -142,7 +143,7 @@ class Simulator:
         if self._truth is None:
             plant = self.plant
             tip, wxyz = plant.tip_pose()
-            clearance, own = plant.clearances(), plant.self_clearance()
+            clearance, own = plant.clearances(self.exact), plant.self_clearance(self.exact)
             tau = self.bank.f[:, TORQUE].copy()
             self._truth = Truth(
                 self.time, np.array(plant.q), np.array(plant.qd), tau, tip, wxyz, clearance, own, len(plant.contacts)

@@ -433,7 +433,7 @@ def test_what_the_base_stands_on_is_no_contact(tmp_path: Path) -> None:
 
 
 def test_self_clearance_leaves_neighbours_out_and_sees_a_fold(panda: Plant) -> None:
-    names = {frozenset((panda.links[a], panda.links[b])) for a, b in panda.far_pairs}
+    names = {frozenset((panda.links[a], panda.links[b])) for a, b in panda.oracle.far_pairs}
     for k in range(7):
         assert frozenset((f"panda_link{k}", f"panda_link{k + 1}")) not in names
     assert frozenset(("panda_hand", "panda_leftfinger")) not in names
