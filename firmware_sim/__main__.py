@@ -229,7 +229,7 @@ def run(args: argparse.Namespace) -> None:
     """Open everything, serve until a signal, write the report."""
     scenario = _scenario(args.scenario)
     if is_rover(args.config):
-        serve(open_rover(args.config, scenario, args.inject, wait=not args.now), args.config, args.report)
+        serve(open_rover(args.config, scenario, args.inject, not args.now, args.seed), args.config, args.report)
         return
     simulator = open_simulator(args.config, scenario, None, args.seed, None, args.inject, wait=not args.now)
     simulator.exact = False  # the report tells the least distances alone

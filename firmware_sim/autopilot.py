@@ -5,6 +5,7 @@ them. It believes nobody: what it is told is checked again here.
 """
 
 import math
+import random
 from typing import Any, NamedTuple
 
 from firmware_sim.mav import Endpoint
@@ -13,7 +14,16 @@ from firmware_sim.vehicle import Vehicle
 GUIDED, HOLD, MANUAL = 15, 4, 0  # custom modes of ArduPilot Rover
 OFFBOARD, LOITER, PX4_MANUAL = 6 << 16, 4 << 16 | 3 << 24, 1 << 16
 SCHEDULER_HZ = 40.0  # the fastest stream of a 50 Hz scheduler
-STREAMS = {32: "local", 30: "attitude", 331: "odometry", 193: "ekf", 230: "estimator", 330: "obstacles", 49: "origin"}
+STREAMS = {
+    32: "local", 30: "attitude", 331: "odometry", 193: "ekf", 230: "estimator", 49: "origin", 24: "gps", 33: "global",
+    242: "home", 148: "version",
+}  # fmt: skip
+UNASKED_HZ = 4.0  # of what it streams when nobody may ask
+DEAD_RECKONING = 8.0  # [s] that ArduPilot goes on by its wheels and gyroscopes without a GPS, and says nothing
+BIAS_TURN = 0.05  # [rad/s] by which the bias of the reported speed turns
+POSITION_NOISE, SPEED_NOISE = 0.005, 0.02  # [m], [m/s]
+FIRMWARE = {"ardupilot": 0x040500FF, "px4": 0x010E00FF}  # 4.5.0, 1.14.0
+OLD_FIRMWARE = 0x040000FF  # its local position is relative to home
 EPOCH = 1.79e9  # [s] Unix time when the simulation begins; in real time it is what the clock says
 COAST = 3.0  # [s] that ArduPilot goes on with the last set-point
 GCS_SILENCE = 5.7  # [s] until the GCS failsafe holds, when it is on
@@ -38,18 +48,23 @@ class Wanted(NamedTuple):
 class Autopilot:
     """One vehicle's autopilot; time is what `step` makes of it."""
 
-    def __init__(self, kind: str, vehicle: Vehicle, endpoint: Endpoint, gcs: int) -> None:
+    def __init__(self, kind: str, vehicle: Vehicle, endpoint: Endpoint, gcs: int, seed: int = 0) -> None:
+        self.random = random.Random(seed)
+        self.bias, self.bias_angle = 0.1, self.random.uniform(-math.pi, math.pi)  # [m/s], [rad] of the reported speed
+        self.drift = 0.0  # [m/s] by which the reported position walks away
+        self.cold = 0.0  # [s] after boot without a position
+        self.gps_lost_at: float | None = None  # [s]
+        self.rates_denied = self.home_relative = self.frozen = False
+        self.home = (vehicle.x, vehicle.y)
         self.kind, self.vehicle, self.end, self.gcs = kind, vehicle, endpoint, gcs
         self.parameters = dict(PARAMETERS[kind])
         self.time = self.booted = 0.0  # [s]
         self.offset = (0.0, 0.0)  # [m] east, north: what its estimator is off by
         self.resets = 0
-        self.estimator_bad = self.arming_refused = self.silent = self.mute = self.blind = False
+        self.estimator_bad = self.arming_refused = self.silent = self.mute = self.proximity_dead = False
         self.aborted = ""  # why it died
         self.epoch = EPOCH
         self.stick: tuple[float, float] | None = None  # [m/s, rad/s] a person drives
-        self.scan: list[float] = []  # [m] of the range sensor, and whether it is new
-        self.scan_new = False
         self.log: list[tuple[float, str]] = []
         self.boot()
 
@@ -71,6 +86,12 @@ class Autopilot:
     def uptime(self) -> float:
         """Time [s] since it booted."""
         return self.time - self.booted
+
+    @property
+    def positioned(self) -> bool:
+        """Tell whether its estimator has a position: not while it is cold, nor long after the GPS was lost."""
+        reckoning = self.gps_lost_at is None or self.time - self.gps_lost_at < DEAD_RECKONING
+        return self.uptime >= self.cold and reckoning
 
     @property
     def ours(self) -> int:
@@ -121,6 +142,8 @@ class Autopilot:
         if m.command == 512:
             if int(m.param1) not in STREAMS:
                 return DENIED
+            if int(m.param1) in (49, 242, 32, 33) and not self.positioned:
+                return FAILED
             self.outbox.append(getattr(self, f"_{STREAMS[int(m.param1)]}")())
             return ACCEPTED
         if m.command == 176:
@@ -130,6 +153,8 @@ class Autopilot:
         return UNSUPPORTED
 
     def _interval(self, message: int, microseconds: float) -> int:
+        if self.rates_denied:
+            return DENIED
         mine = {"ardupilot": (331, 230), "px4": (193,)}[self.kind]
         if message not in STREAMS or message in mine:
             return FAILED
@@ -147,7 +172,7 @@ class Autopilot:
             return UNSUPPORTED
         mode = int(m.param2) if self.kind == "ardupilot" else int(m.param2) << 16 | int(m.param3) << 24
         if mode == self.ours:
-            if self.estimator_bad:
+            if self.estimator_bad or not self.positioned:
                 self.note("Mode change to GUIDED failed: requires position")
                 return FAILED
             if self.kind == "px4" and not self._offered():
@@ -179,15 +204,16 @@ class Autopilot:
                 self.note(f"Arm: {reason}")
                 return FAILED
             self.armed = True
+            self.home = (self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
         self.heartbeat_due = self.time
         return ACCEPTED
 
     def _unready(self) -> str:
-        if self.estimator_bad:
+        if self.estimator_bad or not self.positioned:
             return "Need Position Estimate"
         if self.arming_refused:
             return "Radio failsafe on, hardware safety switch is on and the battery is below its arming voltage"
-        if self.parameters.get("PRX1_TYPE") == 2.0 and self.blind:
+        if self.parameters.get("PRX1_TYPE") == 2.0 and self.proximity_dead:
             return "PRX1: No Data"
         return ""
 
@@ -227,10 +253,29 @@ class Autopilot:
         self._failsafes()
         v, side, w = self._motion()
         self.vehicle.step(v, side, w, dt)
+        self._wander(dt)
         self._emit()
         out, self.outbox = self.outbox, []
         unix = self.epoch + self.time
         return [] if self.silent else [self.end.pack(m, unix) for m in out]
+
+    def _wander(self, dt: float) -> None:
+        """Let the estimator's errors grow: a bias of the speed that turns, a drift, a position that is reckoned."""
+        self.bias_angle += BIAS_TURN * dt
+        east, north = self._bias()
+        rate = self.drift
+        if self.gps_lost_at is not None:
+            self.offset = (self.offset[0] + east * dt, self.offset[1] + north * dt)
+        if rate:
+            angle = 0.1 * self.time
+            self.offset = (
+                self.offset[0] + rate * math.cos(angle) * dt, self.offset[1] + rate * math.sin(angle) * dt
+            )  # fmt: skip
+        if not self.armed:
+            self.home = (self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
+
+    def _bias(self) -> tuple[float, float]:
+        return self.bias * math.cos(self.bias_angle), self.bias * math.sin(self.bias_angle)
 
     def _failsafes(self) -> None:
         if self.parameters.get("FS_GCS_ENABLE") and self.time - self.heard > GCS_SILENCE and self.mode == GUIDED:
@@ -268,20 +313,26 @@ class Autopilot:
             base = 1 | (128 if self.armed else 0) | (8 if self.mode == self.ours else 0)
             status = 4 if self.armed else 3
             self.outbox.append(self.end.codec.heartbeat_encode(10, autopilot, base, self.mode, status))
-        for message, interval in self.intervals.items():
-            if message == 330:
+        asked = dict.fromkeys((32, 30, 193, 24), 1.0 / UNASKED_HZ) if self.rates_denied else self.intervals
+        for message, interval in asked.items():
+            if message in (32, 33, 331) and (self.frozen or not self.positioned):
                 continue
-            if self.time >= self.due[message] - 1e-9:
-                self.due[message] += interval * max(1, math.ceil((self.time - self.due[message]) / interval))
+            due = self.due.setdefault(message, self.time)
+            if self.time >= due - 1e-9:
+                self.due[message] += interval * max(1, math.ceil((self.time - due) / interval))
                 self.outbox.append(getattr(self, f"_{STREAMS[message]}")())
-        if 330 in self.intervals and self.scan_new and not self.blind:
-            self.outbox.append(self._obstacles())
-        self.scan_new = False
 
     def _ned(self) -> tuple[float, float, float, float]:
         v = self.vehicle
-        east, north = v.velocity
-        return v.y + self.offset[1], v.x + self.offset[0], north, east
+        east, north = (a + b for a, b in zip(v.velocity, self._bias(), strict=True))
+        x, y = v.x + self.offset[0], v.y + self.offset[1]
+        if self.home_relative:
+            x, y = x - self.home[0], y - self.home[1]
+        shake = self.random.gauss
+        return (
+            y + shake(0.0, POSITION_NOISE), x + shake(0.0, POSITION_NOISE),
+            north + shake(0.0, SPEED_NOISE), east + shake(0.0, SPEED_NOISE),
+        )  # fmt: skip
 
     def _yaw(self) -> float:
         return math.remainder(0.5 * math.pi - self.vehicle.yaw, 2.0 * math.pi)
@@ -307,19 +358,46 @@ class Autopilot:
 
     def _ekf(self) -> Any:
         flags, variance = (128 | 1, 1.4) if self.estimator_bad else (1 | 2 | 4 | 8 | 16 | 32 | 512, 0.02)
+        if not self.positioned:
+            flags = 1024 if self.uptime < self.cold else 128 | 1 | 2
         return self.end.codec.ekf_status_report_encode(flags, variance, variance, variance, 0.1, 0.0)
 
     def _estimator(self) -> Any:
-        flags, ratio = (128 | 1, 2.0) if self.estimator_bad else (1 | 2 | 4 | 8 | 16 | 32, 0.1)
+        bad = self.estimator_bad or not self.positioned
+        flags, ratio = (128 | 1, 2.0) if bad else (1 | 2 | 4 | 8 | 16 | 32, 0.1)
         stamp = round(self.uptime * 1e6)
         return self.end.codec.estimator_status_encode(stamp, flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, 0.3, 0.3)
 
-    def _obstacles(self) -> Any:
-        reach = 1200
-        cells = [reach + 1 if not math.isfinite(d) else min(max(round(100.0 * d), 1), reach) for d in self.scan]
-        return self.end.codec.obstacle_distance_encode(
-            round(self.uptime * 1e6), 0, [*cells, *[65535] * (72 - len(cells))], 5, 5, reach, 5.0, 0.0, 12
+    def _gps(self) -> Any:
+        fix = 1 if self.gps_lost_at is not None or self.uptime < self.cold else 6
+        lat, lon = self._place(self.vehicle.x, self.vehicle.y)
+        return self.end.codec.gps_raw_int_encode(
+            round(self.uptime * 1e6), fix, lat, lon, 584000, 80 if fix > 3 else 9999, 65535, 65535, 65535,
+            14 if fix > 3 else 2,
+        )  # fmt: skip
+
+    def _global(self) -> Any:
+        _, _, north, east = self._ned()
+        lat, lon = self._place(self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
+        return self.end.codec.global_position_int_encode(
+            self._ms(), lat, lon, 584000, 0, round(100.0 * north), round(100.0 * east), 0, 65535
         )
+
+    def _home(self) -> Any:
+        lat, lon = self._place(*self.home)
+        return self.end.codec.home_position_encode(lat, lon, 584000, 0, 0, 0, (1, 0, 0, 0), 0, 0, 0)
+
+    def _version(self) -> Any:
+        firmware = OLD_FIRMWARE if self.home_relative else FIRMWARE[self.kind]
+        return self.end.codec.autopilot_version_encode(
+            0, firmware, 0, 0, 0, b"rtctl-dbl", b"rtctl-dbl", b"rtctl-dbl", 0, 0, 1
+        )
+
+    def _place(self, x: float, y: float) -> tuple[int, int]:
+        """Return latitude and longitude [1e-7 deg] of a place [m] east, north of the origin."""
+        lat = ORIGIN[0] + y / 111318.84502145034
+        lon = ORIGIN[1] + x / (111318.84502145034 * math.cos(math.radians(0.5 * (lat + ORIGIN[0]))))
+        return round(lat * 1e7), round(lon * 1e7)
 
     def _origin(self) -> Any:
         return self.end.codec.gps_global_origin_encode(round(ORIGIN[0] * 1e7), round(ORIGIN[1] * 1e7), 584000)

@@ -4,6 +4,7 @@
 without one the fault holds for every joint. Without a duration, or with 0, it lasts.
 """
 
+import math
 import random
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -40,6 +41,9 @@ class Fault(NamedTuple):
     start: int
     end: int
     joint: int
+    low: float = -180.0  # [deg] of a range sensor's angles, clockwise from the front
+    high: float = 180.0
+    value: float = math.nan  # how much, where the kind has a size
 
 
 def _joint(value: Any, names: Sequence[str]) -> int:
@@ -60,12 +64,19 @@ def _fault(kind: str, at_s: float, joint: Any, duration_s: float | None, names: 
     return Fault(kind, start, end, _joint(joint, names))
 
 
-def fault_at(kind: str, at_s: float, duration_s: float | None, kinds: Iterable[str]) -> Fault:
+def fault_at(
+    kind: str,
+    at_s: float,
+    duration_s: float | None,
+    kinds: Iterable[str],
+    angles: tuple[float, float] = (-180.0, 180.0),
+    value: float = math.nan,
+) -> Fault:
     """Return a fault of the whole machine. SettingsError for a kind that is none of `kinds`."""
     if kind not in kinds:
         raise SettingsError(f"fault: {kind} is not one of {', '.join(kinds)}")
     start = round(at_s * NS)
-    return Fault(kind, start, start + round(duration_s * NS) if duration_s else FOREVER, -1)
+    return Fault(kind, start, start + round(duration_s * NS) if duration_s else FOREVER, -1, *angles, value)
 
 
 def faults_of(tables: Iterable[dict[str, Any]], names: Sequence[str]) -> list[Fault]:

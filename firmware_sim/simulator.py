@@ -171,7 +171,10 @@ def open_simulator(
     scenario's clock stands at 0 until a drive is enabled. Raises SettingsError.
     """
     if is_rover(config_path):
-        rover: Any = open_rover(config_path, scenario, inject, wait)  # exchange, truth and close: all that is asked
+        of_what = int((scenario or {}).get("seed", seed))
+        rover: Any = open_rover(
+            config_path, scenario, inject, wait, of_what
+        )  # exchange, truth, close: all that is asked
         return rover  # type: ignore[no-any-return]
     settings = load(config_path, control_hz)
     play = scenario or {}

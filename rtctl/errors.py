@@ -30,6 +30,16 @@ class HandshakeError(ConfigError):
     """The bus does not answer as the config says it must; drives were never enabled."""
 
 
+class AbsentError(RtctlError):
+    """What the program waited for did not come in the time that it was given: no file can cure that."""
+
+
+class StoppedError(RtctlError):
+    """Somebody ended the program while it waited; nothing had begun."""
+
+    exit_code = EXIT_OK
+
+
 class LinkError(RtctlError):
     """A bus or socket could not be opened or died in a way that retrying cannot mend."""
 

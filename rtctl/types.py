@@ -56,6 +56,7 @@ class Status(IntEnum):
     LIMITED = 7  # joint limits hold the arm
     UNREACHABLE = 8  # stretched out: the goal is farther than the links are long
     ESCAPING = 9  # circulating around what blocks the way
+    BLIND = 10  # a base stands: where it would go has not been seen
 
 
 class Severity(IntEnum):

@@ -132,7 +132,7 @@ def test_the_shipped_files_pass_and_check_tells_what_follows_from_them(capsys, t
         report = json.loads(capsys.readouterr().out)
         rows = {row["name"]: row for row in report["rows"]}
         assert rows["signing"]["verdict"] == "warn"
-        assert rows["way to rest"]["value"] == pytest.approx(2.0 * 0.75 + 4.0 / 3.0)
+        assert rows["way to rest"]["value"] == pytest.approx(2.0 * 0.83 + 4.0 / 3.0)
         assert rows["gap that is passed"]["value"] == pytest.approx(2.0 * (0.5 + 0.6 + 0.35 / 2**0.5))
     assert cli.main(["run", str(ROVER), "--lockstep"]) == 2
     assert "rtctl sim" in capsys.readouterr().err

@@ -70,7 +70,8 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
     scan = np.full(SECTORS, np.inf)
     scan[0], scan[18] = 5.0, 3.0  # ahead, and to the right
     yaw = math.radians(90.0)
-    seen = occupancy.looked(occupancy.empty(np.zeros(2)), np.array([1.0, 2.0]), yaw, scan, 0.0, step, 12.0)
+    look = occupancy.Look(np.array([1.0, 2.0]), yaw, step, scan, 12.0)
+    seen = occupancy.looked(occupancy.empty(np.zeros(2)), look, 0)
     near = occupancy.returns_near(seen, np.array([1.0, 2.0]), 8.0)
     oracle = np.array([[1.0, 7.0], [4.0, 2.0]])
     assert len(near) == 2
@@ -78,7 +79,7 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
         assert np.abs(near - at).max(axis=1).min() <= 0.5 * CELL + 1e-9
     clear = np.full(SECTORS, np.inf)
     for _ in range(3):
-        seen = occupancy.looked(seen, np.array([1.0, 2.0]), yaw, clear, 0.0, step, 12.0)
+        seen = occupancy.looked(seen, look._replace(ranges=clear), 0)
     assert not seen.cells.any()
     kept = charted([[10.0, 3.0]])
     away = occupancy.moved(kept, np.array([25.0, 0.0]))
@@ -228,11 +229,11 @@ def test_the_governor_sees_told_obstacles_as_far_off_as_they_are():
 def test_estimate_is_filterpys_on_the_same_model():
     noise, dt = BASE.noise, 0.02
     e = estimator.start(np.array([1.0, -2.0]), 0.0, noise)
-    oracle = KalmanFilter(2, 2)
-    oracle.x, oracle.P, oracle.H = np.array([1.0, 0.0]), e.P.copy(), np.eye(2)
-    oracle.F = np.array([[1.0, dt], [0.0, 1.0]])
-    g = np.array([0.5 * dt * dt, dt])
-    oracle.Q = noise.acceleration**2 * np.outer(g, g)
+    oracle = KalmanFilter(3, 2)
+    oracle.x, oracle.P = np.array([1.0, 0.0, 0.0]), e.P.copy()
+    oracle.F = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    g = np.array([0.5 * dt * dt, dt, 0.0])
+    oracle.Q = noise.acceleration**2 * np.outer(g, g) + np.diag([0.0, 0.0, estimator.BIAS_WALK**2 * dt])
     for _ in range(50):
         e = estimator.predicted(e, dt, noise)
         oracle.predict()
@@ -240,9 +241,9 @@ def test_estimate_is_filterpys_on_the_same_model():
         e, _ = estimator.measured(e, z, v, age, noise)
         R = np.diag([noise.position**2 + (0.5 * noise.acceleration * age**2) ** 2,
                      noise.velocity**2 + (noise.acceleration * age) ** 2])  # fmt: skip
-        oracle.update(np.array([z[0] + age * v[0], v[0]]), R=R)
-        np.testing.assert_allclose([e.x[0], e.v[0]], oracle.x, rtol=1e-9)
-        np.testing.assert_allclose(e.P, oracle.P, rtol=1e-9)
+        oracle.update(np.array([z[0], v[0]]), R=R, H=np.array([[1.0, -age, 0.0], [0.0, 1.0, 1.0]]))
+        np.testing.assert_allclose([e.x[0], e.v[0], e.b[0]], oracle.x, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(e.P, oracle.P, rtol=1e-9, atol=1e-15)
 
 
 def healthy(**changes) -> BaseFeedback:

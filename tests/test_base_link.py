@@ -17,18 +17,19 @@ import numpy as np
 import pytest
 from pamoja import mavlink as pamoja
 
-from firmware_sim.inject import fault_at
-from firmware_sim.rover import KINDS
+from firmware_sim import rover
 from firmware_sim.rover_serve import open_port
-from rtctl.errors import HandshakeError, LinkError
+from rtctl.app.rover import open_link
+from rtctl.errors import EXIT_FAILED, AbsentError, HandshakeError, LinkError, StoppedError
 from rtctl.hal.mavlink.link import dialect
 from rtctl.hal.mavlink.talk import Order, Talk, Word, stream
 from rtctl.hal.mavlink.view import Clock, local_of
-from rtctl.hal.mavlink.wire import Udp, open_wire
+from rtctl.hal.mavlink.wire import InProcess, Udp, open_wire
 from rtctl.log import read
 from rtctl.log.record.writer import McapSink
 from rtctl.log.view.tlog import export_tlog
 from rtctl.rover.signals import Ask, BaseCommand
+from rtctl.spec.base import load
 from rtctl.types import Link, State, Verb
 from tests.base_lab import ROVER, ROVER_PX4, BaseLab
 
@@ -56,13 +57,15 @@ def theirs(name: str, sequence: int = 0, system: int = 1, component: int = 1, **
     return pamoja.from_dict(pamoja.schema_for(name), values).to_frame(header).bytes
 
 
-def bare(message: int, extra: int, layout: str, *values) -> bytes:
+def bare(message: int, extra: int, layout: str, *values, component: int = 1) -> bytes:
     """Return a message of the vehicle that the other implementation frames, its fields laid out by hand."""
-    return pamoja.MavlinkFrame.raw(pamoja.MavlinkHeader(1, 1, 0), message, extra, struct.pack(layout, *values)).bytes
+    header = pamoja.MavlinkHeader(1, component, 0)
+    return pamoja.MavlinkFrame.raw(header, message, extra, struct.pack(layout, *values)).bytes
 
 
-def obstacle_distance(cells, increment, increment_f, offset, frame) -> bytes:
-    return bare(330, 23, "<Q72HHHBBffB", 0, *cells, 5, 1200, 0, increment, increment_f, offset, frame)
+def obstacle_distance(cells, increment, increment_f, offset, frame, component=195, low=5) -> bytes:
+    fields = (0, *cells, low, 1200, 0, increment, increment_f, offset, frame)
+    return bare(330, 23, "<Q72HHHBBffB", *fields, component=component)
 
 
 def distance_sensor(orientation, current) -> bytes:
@@ -162,7 +165,7 @@ def test_nothing_arms_before_rtctl_arm_and_mode_and_arming_are_acknowledged_comm
 def test_a_rate_that_is_denied_falls_back_to_the_next_and_what_is_not_known_is_left():
     lab = BaseLab()
     assert lab.link.talk.rates["LOCAL_POSITION_NED"] == lab.link.talk.rates["ATTITUDE"] == 40.0
-    assert lab.link.talk.rates["OBSTACLE_DISTANCE"] == 10.0
+    assert "OBSTACLE_DISTANCE" not in lab.link.talk.rates  # no autopilot of this kind sends it
     assert "DISTANCE_SENSOR" not in lab.link.talk.rates
     talk, asked = Talk(), []
     talk.give(stream("x", 32, 50.0))
@@ -193,6 +196,7 @@ def test_an_acknowledgement_is_matched_by_command_waits_while_in_progress_and_re
 def test_other_systems_and_components_are_not_believed_nor_are_damaged_or_unknown_frames():
     lab = BaseLab()
     before = lab.link.read(0, 0, 0.0, 0.0)
+    lab.link.counts.clear()
     good = {"time_boot_ms": 90_000, "x": 5.0, "y": 6.0}
     broken = bytearray(theirs("LOCAL_POSITION_NED", **good))
     broken[12] ^= 1
@@ -274,7 +278,7 @@ def test_single_distance_sensors_are_sectors_and_grow_stale():
         distance_sensor(6, 800),  # nothing in range
         distance_sensor(25, 100),  # looks down
     )
-    np.testing.assert_allclose(f.beams, (-1, -1, 2.5, -1, -1, -1, -1, -1))
+    np.testing.assert_allclose(f.beams, (-1, -1, 2.5, -1, -1, -1, np.inf, -1))
     for _ in range(30):
         f = fed(lab)
         lab.link.wire.send([])
@@ -306,23 +310,78 @@ def test_latitude_and_longitude_fall_where_a_geodesic_puts_them():
         np.testing.assert_allclose((east, north), (east_true, north_true), rtol=5e-3)
 
 
-def test_a_wrong_autopilot_vehicle_or_silence_is_refused_at_the_start(tmp_path):
+def greeted(config: Path, double: Any, *tables: str, **given: Any):
+    """Return the link of a config to a double, after its handshake."""
+    link = open_link(load(config), config, InProcess(double.exchange, 0.02))
+    return link, link.handshake(**given)
+
+
+def test_a_wrong_autopilot_is_a_config_error_and_one_that_is_not_there_yet_is_none(tmp_path):
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(ROVER.read_text().replace('"ardupilot"', '"px4"'))
-    from firmware_sim import rover
-    from rtctl.app.rover import open_link
-    from rtctl.hal.mavlink.wire import InProcess
-    from rtctl.spec.base import load
-
-    config = load(wrong)
-    double = rover.open_rover(ROVER)
-    link = open_link(config, wrong, InProcess(double.exchange, 0.02))
     with pytest.raises(HandshakeError, match=r"link.autopilot: got a heartbeat of ardupilot, wanted px4"):
-        link.handshake()
-    double.faults.append(fault_at("silent", 0.0, None, KINDS))
-    link = open_link(load(ROVER), ROVER, InProcess(double.exchange, 0.02))
-    with pytest.raises(HandshakeError, match=r"link.url: got silence, wanted the heartbeat of an ardupilot rover"):
-        link.handshake()
+        greeted(wrong, rover.open_rover(ROVER))
+    timed = tmp_path / "timed.toml"
+    timed.write_text(ROVER.read_text().replace('type = "mavlink"', 'type = "mavlink"\nhandshake_s = 5.0'))
+    double = rover.open_rover(ROVER, inject=["silent@0.0"])
+    with pytest.raises(
+        AbsentError, match=r"link.url: got silence, wanted the heartbeat of an ardupilot rover"
+    ) as caught:
+        greeted(timed, double)
+    assert caught.value.exit_code == EXIT_FAILED  # no file can cure it: a unit tries again
+
+
+def test_a_cold_autopilot_is_waited_for_and_what_is_missing_is_told():
+    told: list[str] = []
+    double = rover.open_rover(ROVER, inject=["cold_start@0.0"])
+    link, start = greeted(ROVER, double, say=told.append)
+    assert 60.0 < link.wire.now() < 70.0
+    assert start.position_age < 0.5
+    assert any("no position or attitude" in text for text in told)
+    for _ in range(300):
+        link.read(-1, 0, 0.0, 0.0)
+        link.write(BaseCommand(Ask.SILENCE, 0.0, 0.0, np.zeros(2)))
+    assert link.view.origin == pytest.approx((-35.363262, 149.165237))  # asked for again: cold, it was refused
+    late = rover.open_rover(ROVER, inject=["cold_start@0.0"])
+    with pytest.raises(StoppedError):
+        greeted(ROVER, late, ended=lambda: late.autopilot.time > 3.0)
+
+
+def test_another_vehicle_that_is_heard_first_is_passed_over(tmp_path):
+    any_id = tmp_path / "any.toml"
+    any_id.write_text(ROVER.read_text().replace("vehicle_id = 1\n", ""))
+    double = rover.open_rover(ROVER)
+    copter = theirs("HEARTBEAT", system=7, type=2, autopilot=3, custom_mode=0, base_mode=1)
+    link = open_link(load(any_id), any_id, InProcess(lambda packets: [copter, *double.exchange(packets)], 0.02))
+    link.handshake()
+    assert link.vehicle == (1, 1)
+    assert any("passed over" in line for line in link.news)
+
+
+def test_denied_streams_are_told_and_what_comes_unasked_is_driven_by():
+    lab = BaseLab(inject=["rates_denied@0.0"])
+    assert lab.link.talk.rates == {}
+    assert any("no stream was granted" in line for line in lab.link.news)
+    lab.armed()
+    assert lab.arrive(8.0, 1.0)
+    truth = lab.rover.truth()
+    assert math.hypot(truth.x - 8.0, truth.y - 1.0) < 0.5
+
+
+def test_the_first_read_of_the_loop_has_all_packets_since_the_start_and_the_state_of_now():
+    lab = BaseLab()
+    handshake = list(lab.link._backlog)
+    assert len(handshake) > 100
+    for _ in range(250):  # the recorder starts, say: nobody reads
+        lab.link.wire._waiting += lab.rover.exchange([])
+        lab.link.wire._cycles += 1
+    lab.link.settle()
+    f = lab.link.read(0, 0, 0.0, 0.0)
+    assert lab.link.received[: len(handshake)] == handshake
+    assert len(lab.link.received) > len(handshake) + 500
+    assert f.position_age < 0.1
+    assert f.uplink_age == 0.0  # nothing was asked meanwhile: that is no deaf vehicle
+    assert not lab.link._backlog
 
 
 def test_frames_refused_is_a_fault_that_disturbs_nothing_and_a_signed_link_takes_no_others(tmp_path):
@@ -450,8 +509,6 @@ def test_all_bytes_are_in_the_log_and_pymavlinks_own_reader_takes_the_tlog(tmp_p
     sink = McapSink(tmp_path / "run.mcap", header_of(probe.config, Path(ROVER), probe.base, probe.start))
     lab = BaseLab(relay=relay, sink=sink)
     sent.clear()
-    received[:] = [raw for raw, _ in lab.link.wire.receive()]
-    lab.link.wire._waiting = list(received)
     lab.armed().run(1.0)
     received = received[: len(received) - len(lab.link.wire._waiting)]
     sink.close("end")

@@ -6,27 +6,27 @@ The oracle is the double's own geometry: distances of the footprint to the solid
 import numpy as np
 import pytest
 
-from rtctl.app.sim import simulate
 from rtctl.types import ObstacleEdit, Shape, State, Status, Verb
-from tests.base_lab import CONFIGS, ROVER, ROVER_PX4, UPRIGHT, BaseLab, Relay, some_world
-
-# time to goal [s] that an autopilot's own avoidance needed in the same world (ArduPilot BendyRuler at 2 m/s)
-WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}
+from tests.base_lab import ROVER, ROVER_PX4, UPRIGHT, BaseLab, Relay, some_world
+from tools.rover_campaign import CLEARANCE, WORLDS, played, sight, worlds
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_four_worlds_with_half_a_metre_to_spare_and_no_slower_than_the_autopilots_own_avoidance(world, tmp_path):
-    text = (CONFIGS / "worlds" / f"{world}.toml").read_text()
-    short = tmp_path / "world.toml"
-    lines = [line for line in text.splitlines() if not line.startswith(("robot", "duration_s"))]
-    head = [f'robot = "{CONFIGS / "rover.toml"}"', f"duration_s = {WORLDS[world] + 2.0}"]
-    short.write_text("\n".join([*head, *lines]))
-    found = simulate(short)
-    assert found["arrived"]
-    assert found["time_to_goal_s"] <= WORLDS[world]
-    assert found["min_clearance_m"]["all"] >= 0.5
-    assert found["contacts"] == 0
-    assert found["faults"] == []
+@pytest.mark.parametrize("case", [c for c in worlds(2) if c.scenario.seed == 1], ids=lambda c: c.world)
+def test_four_worlds_keep_clear_and_are_no_slower_than_the_autopilots_own_avoidance(case):
+    run = played(case)
+    assert run.arrived
+    assert run.near_s is not None
+    assert run.near_s <= WORLDS[run.world]
+    assert run.clearance >= CLEARANCE
+    assert run.contacts == 0
+    assert run.why == "arrived"  # and no fault
+
+
+@pytest.mark.parametrize("case", list(sight(8)), ids=lambda c: f"{c.kind}-{c.world}-{c.scenario.seed}")
+def test_who_knows_too_little_or_is_told_wrongly_touches_nothing_and_says_why_it_stands(case):
+    run = played(case)
+    assert run.fine, run
+    assert run.contacts == 0
 
 
 @pytest.mark.parametrize("verb", [Verb.NONE, Verb.DISARM, Verb.TERM])

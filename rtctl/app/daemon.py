@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from rtctl import design as cfg
@@ -80,7 +81,8 @@ class Family(NamedTuple):
     place: Callable[[Any], str]  # the link, as people read it
     open: Callable[[Any, Path], Any]  # the link
     bounds: Callable[[Any, Any], Bounds]  # (robot, link)
-    greet: Callable[[Any, Any, bool], Any]  # (config, link, lockstep): the first feedback
+    greet: Callable[[Any, Any, bool, Signals], Any]  # (config, link, lockstep, signals): the first feedback
+    settle: Callable[[Any], None]  # (link): what came since then is taken, just before the loop
     machine: Callable[[Any], Machine]  # (link)
     header: Callable[[Any, Path, Any, Any], Header]  # (config, path, robot, first feedback)
     status: Callable[[Servo, Recorder], dict[str, Any]]
@@ -89,15 +91,18 @@ class Family(NamedTuple):
     names: Callable[[int], tuple[str, ...]]  # of faults
 
 
-def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> int:
+def run(config_path: str | Path, lockstep: bool = False, dry: bool = False, timeout: float | None = None) -> int:
     """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
 
     lockstep: each slot waits for the replies instead of for its time (simulated drives that keep step).
     dry: everything is computed and logged, but only stop frames are sent.
+    timeout: [s] that a base's vehicle is waited for, in place of what the config says.
     """
     path = Path(config_path)
     family = _family(path, lockstep)
     config = family.load(path)
+    if timeout is not None:
+        config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, handshake_s=timeout))
     signals = Signals()
     with ExitStack() as stack:
         resource, label = family.lock(config)
@@ -110,7 +115,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
             closing(Console(config.console.socket or default_path(robot.name), robot.dt, bounds))
         )
         say(f"rtctl: {robot.name} on {family.place(config)}, console {console.path}")
-        start = family.greet(config, link, lockstep)
+        start = family.greet(config, link, lockstep, signals)
         header = family.header(config, path, robot, start)
         recorder = _recorder(config, header._replace(extra={**header.extra, **surroundings(config, link, dry)}))
         servo = Servo(robot, link, recorder, np.zeros(0), dry, machine=family.machine(link), start=start)
@@ -124,6 +129,7 @@ def run(config_path: str | Path, lockstep: bool = False, dry: bool = False) -> i
         service = stack.enter_context(closing(Service(robot.dt)))
         service.ready(f"{robot.name}: IDLE")
         say(f"rtctl: ready, log {recorder.stats().path}")
+        family.settle(link)
         code, failure = EXIT_FAILED, None
         slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
         try:
@@ -160,7 +166,10 @@ def _family(path: Path, lockstep: bool) -> Family:
         place=lambda config: config.link.url,
         open=rover.open_link,
         bounds=rover.bounds_of,
-        greet=lambda config, link, lockstep: link.handshake(),
+        greet=lambda config, link, lockstep, signals: link.handshake(
+            lambda text: say(f"rtctl: {text}"), lambda: signals.count > 0
+        ),
+        settle=lambda link: link.settle(),
         machine=rover.machine_of,
         header=rover.header_of,
         status=lambda servo, recorder: rover.status(servo, _log_status(recorder)),
@@ -197,7 +206,7 @@ def surroundings(config: Any, link: Any, dry: bool) -> dict[str, str]:
     }
 
 
-def _greeted(config: Config, link: CanLink, lockstep: bool) -> Feedback:
+def _greeted(config: Config, link: CanLink, lockstep: bool, signals: Signals) -> Feedback:
     listen = 0.0 if lockstep else 1e-3 * config.link.listen_ms
     return first_feedback(handshake(link, listen=listen, recover=True).q)
 
@@ -362,6 +371,7 @@ ARM_FAMILY = Family(
         tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
     ),
     greet=_greeted,
+    settle=lambda link: None,
     machine=lambda link: ARM,
     header=lambda config, path, robot, start: header_of(config, path, robot, start.q),
     status=status,

@@ -1,5 +1,6 @@
 """The mobile base as the daemon and the simulation put it together: its link, its tick's names, its ways to stop."""
 
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from rtctl.design.rover import key_of
 from rtctl.hal.clock import Slot
 from rtctl.hal.mavlink.keys import Keys
 from rtctl.hal.mavlink.link import MavLink, MavSpec
+from rtctl.hal.mavlink.ranging import ANY, ANY_BEAM, SensorSpec
 from rtctl.hal.mavlink.wire import Wire, open_wire
 from rtctl.hal.messages import Bounds
 from rtctl.log.entry import Kind
@@ -29,6 +31,8 @@ from rtctl.types import State, Status, Task
 
 LINK = "vehicle"  # the link's name in the log
 MAV_TX, MAV_RX = int(Kind.MAV_TX), int(Kind.MAV_RX)
+SIMULATED_WAIT = 120.0  # [s] of simulated time
+WORDS = 5  # of the vehicle, the newest, that `rtctl status` shows
 FAREWELL = 3.0  # [s] of zero twist at most, when a turn raised
 STILL = 0.1  # [m/s]
 EPOCH = 1_790_000_000 * 10**9  # [ns] Unix time at which simulations begin
@@ -36,7 +40,10 @@ ANGLE_TOLERANCE = 3.2  # [rad] a base's goals have no orientation
 
 
 def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLink:
-    """Return the opened link of a checked config; a simulator's `wire` brings its own clock. Raises RtctlError."""
+    """Return the opened link of a checked config; a simulator's `wire` brings its own clock. Raises RtctlError.
+
+    A real vehicle is waited for unless `handshake_s` bounds it; a simulated one for SIMULATED_WAIT.
+    """
     c = config.link
     key = key_of(config, path)
     state = None if c.state_file is None else Path(c.state_file)
@@ -49,13 +56,22 @@ def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLi
         component=c.component_id,
         vehicle=c.vehicle_id,
         period=1.0 / config.loop.servo_hz,
-        timeout=c.handshake_s,
+        timeout=c.handshake_s or (math.inf if wire is None else SIMULATED_WAIT),
         scan=config.avoid.scan == "required",
+        sensors=sensors_of(config),
     )
     if wire is None:
         return MavLink(spec, open_wire(c.url), Keys(key, state, c.signing_link_id))
     simulated = wire
     return MavLink(spec, wire, Keys(key, state, c.signing_link_id, lambda: EPOCH + round(1e9 * simulated.now())))
+
+
+def sensors_of(config: BaseConfig) -> tuple[SensorSpec, ...]:
+    """Return the range sensors that are listened to: those of the config, or whoever speaks first."""
+    return tuple(
+        SensorSpec(s.name, s.system, s.component, s.message, s.yaw_rad, s.offset_m, s.frame, s.min_m, s.max_m)
+        for s in config.sensor
+    ) or (ANY, ANY_BEAM)
 
 
 def machine_of(link: MavLink) -> Machine:
@@ -82,7 +98,7 @@ def _news(before: BaseMemory, after: BaseMemory) -> list[tuple[str, str]]:
         found.append(("rejected", after.verdict))
     fresh = after.in_force & ~before.in_force
     if fresh:
-        found.append(("fault", faults.describe(fresh, after.state)))
+        found.append(("fault", faults.describe(fresh, after.state) + _numbers(fresh, after)))
     if after.state != before.state:
         found.append(("state", after.state.name))
     if (after.status, after.blocker) != (before.status, before.blocker) and after.status != Status.NO_GOAL:
@@ -92,7 +108,41 @@ def _news(before: BaseMemory, after: BaseMemory) -> list[tuple[str, str]]:
 
 def blocker_name(m: BaseMemory) -> str:
     """Return the name of the obstacle that holds the base, '' for none that has one."""
+    if m.status == Status.BLIND:
+        return unseen(m)
     return m.world.names[m.blocker] if m.blocker >= 0 else ""
+
+
+def unseen(m: BaseMemory) -> str:
+    """Return in words which sectors of the last scan are unknown, in degrees clockwise from the front."""
+    f = m.last
+    width = abs(math.degrees(f.scan_step))
+    front = np.degrees(-(f.scan_start + f.scan_step * np.arange(len(f.scan))))
+    around = round(360.0 / width) if width > 0.0 else 0
+    dark = sorted(float(round(a % 360.0, 1)) for a in front[:around][f.scan[:around] < 0.0])
+    if not dark:
+        return "where it would go has not been seen"
+    if len(dark) >= around:
+        return "no sector of the scan is known"
+    spans: list[list[float]] = []
+    for angle in dark:
+        if spans and angle - spans[-1][1] <= 1.5 * width:
+            spans[-1][1] = angle
+        else:
+            spans.append([angle, angle])
+    if len(spans) > 1 and spans[0][0] + 360.0 - spans[-1][1] <= 1.5 * width:
+        spans[0][0] = spans.pop()[0]
+    return "not seen: " + ", ".join(f"{a - 0.5 * width:g} to {b + 0.5 * width:g} deg" for a, b in spans)
+
+
+def _numbers(fresh: int, m: BaseMemory) -> str:
+    """Return the numbers that belong to faults which have just come."""
+    found = ""
+    if fresh & faults.BIT["no_effect"]:
+        found += f"; asked {m.asked[0]:.2f} m/s and {m.asked[1]:.2f} rad/s, did {m.did[0]:.2f} and {m.did[1]:.2f}"
+    if fresh & faults.BIT["uplink_lost"]:
+        found += f"; nothing that we sent in the last {m.last.uplink_age:.1f} s was answered"
+    return found
 
 
 def bounds_of(base: Base, link: MavLink) -> Bounds:
@@ -146,7 +196,10 @@ def status(servo: Servo, log: dict[str, Any]) -> dict[str, Any]:
             "mode": last.mode, "ours": bool(last.ours), "armed": bool(last.armed), "healthy": bool(last.healthy),
             "position_age_s": _finite(last.position_age), "scan_age_s": _finite(last.scan_age),
             "heartbeat_age_s": _finite(last.heartbeat_age), "streams_hz": dict(link.talk.rates),
-            "frames": dict(link.counts),
+            "frames": dict(link.counts), "uplink_age_s": _finite(last.uplink_age),
+            "known_age_s": _finite(last.known_age), "fix_lost": bool(last.fix_lost), "quality": float(last.quality),
+            "firmware": None if link.view.firmware is None else ".".join(map(str, link.view.firmware)),
+            "words": _words(servo),
         },
         "missed": servo.missed,
         "lateness_s": servo.lateness,
@@ -154,6 +207,12 @@ def status(servo: Servo, log: dict[str, Any]) -> dict[str, Any]:
         "faults": list(faults.names(m.in_force)),
         "log": log,
     }  # fmt: skip
+
+
+def _words(servo: Servo) -> list[list[Any]]:
+    """Return the newest words of the vehicle and about it, [s, text]."""
+    said = [[now, detail] for now, name, detail in servo.events[-200:] if name in ("vehicle", "fault")]
+    return said[-WORDS:]
 
 
 def _finite(value: float) -> float | None:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rtctl.cli.parser import Commands, command
+from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_OK, UsageError
 
 
@@ -22,6 +22,7 @@ def add_before(commands: Commands) -> None:
     run.add_argument("config", metavar="CONFIG")
     run.add_argument("--dry", action="store_true", help="compute and log, but send stop frames alone")
     run.add_argument("--lockstep", action="store_true", help="wait for the drives' replies instead of the clock")
+    run.add_argument("--timeout", metavar="S", type=positive, help="wait no longer for a vehicle that is not there yet")
 
 
 def add_after(commands: Commands) -> None:
@@ -70,7 +71,7 @@ def _check(arguments: argparse.Namespace) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     from rtctl.app.daemon import run
 
-    return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry)
+    return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry, timeout=arguments.timeout)
 
 
 def _sim(arguments: argparse.Namespace) -> int:

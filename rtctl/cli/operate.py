@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import sys
 import time
 from typing import Any
@@ -32,13 +33,17 @@ KEYS_OF = {
     "cloud": "file=FILE.npy|.xyz|.ply point_radius_m [voxel_m]",
 }
 WATCH_PERIOD = 0.1  # [s]
+ARM_TIME = 60.0  # [s] after which `arm` is waited for no more
 EVERYTHING = "*"
 
 
 def add(commands: Commands) -> None:
     """Add the operator's commands."""
     for verb, text in VERBS.items():
-        add_daemon(command(commands, verb, text, f"rtctl {verb} --robot panda", _verb))
+        parser = command(commands, verb, text, f"rtctl {verb} --robot panda", _verb)
+        if verb == "arm":
+            parser.add_argument("--no-wait", action="store_true", help="return when it was taken, not when it is done")
+        add_daemon(parser)
     example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
     goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
@@ -123,7 +128,32 @@ def _said(reply: dict[str, Any], default: str) -> int:
 
 
 def _verb(arguments: argparse.Namespace) -> int:
-    return _said(_demand(arguments, {"verb": arguments.command}), f"{arguments.command}: accepted")
+    if arguments.command != "arm" or arguments.no_wait:
+        return _said(_demand(arguments, {"verb": arguments.command}), f"{arguments.command}: accepted")
+    from rtctl.hal.client import Session, accepted
+
+    with Session(daemon_of(arguments), arguments.reply) as session:
+        accepted(session.ask({"verb": "arm"}))
+        return _armed(session)
+
+
+def _armed(session: Any) -> int:
+    """Wait until the robot runs; print why it does not, in the vehicle's own words where it has any."""
+    from rtctl.hal.client import accepted
+
+    begun, since = time.monotonic(), math.nan
+    while True:
+        status = accepted(session.ask({"verb": "status"}))
+        since = float(status.get("time_s", 0.0)) if math.isnan(since) else since
+        if status.get("state") == "RUN":
+            print("arm: RUN")
+            return EXIT_OK
+        if status.get("state") != "ARMED" or time.monotonic() - begun > ARM_TIME:
+            words = [text for at, text in status.get("vehicle", {}).get("words", ()) if at >= since - WATCH_PERIOD]
+            why = "; ".join([*words, *(() if words else status.get("faults") or ("without a reason",))])
+            print(f"rtctl: arm: {status.get('state')}: {why}", file=sys.stderr)
+            return EXIT_FAILED
+        time.sleep(WATCH_PERIOD)
 
 
 def _set(arguments: argparse.Namespace) -> int:

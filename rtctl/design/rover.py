@@ -54,6 +54,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         safety=SafetyParams(
             s.heartbeat_hold_s, s.heartbeat_stop_s, 1e-3 * s.stale_hold_ms, 1e-3 * s.stale_stop_ms, s.scan_stale_s,
             a.scan == "required", s.obstacle_stale_s, s.jump_m,
+            a.seen_s,
         ),
         obstacles=obstacles,
         meshes=assets.meshes,
@@ -62,6 +63,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         stall=s.stall_s,
         engage=s.engage_s,
         sense=a.range_m,
+        sensors=tuple(sensor.name for sensor in c.sensor) or ("scan", "beams"),
     )  # fmt: skip
     at = np.column_stack([points, np.full(len(points), b.height_m)])
     for i, shape in enumerate(base.obstacles):

@@ -89,7 +89,8 @@ class Session:
     def ask(self, message: dict[str, Any]) -> dict[str, Any]:
         """Return the daemon's reply. Raises LinkError when none comes, RequestError when `message` is too large."""
         try:
-            data = json.dumps(message, allow_nan=False).encode()
+            timed = {"by_s": time.monotonic() + self.timeout, **message} if "verb" in message else message
+            data = json.dumps(timed, allow_nan=False).encode()
         except ValueError as error:  # nan and infinity are not JSON
             raise RequestError(f"not a request: {error}") from None
         return self.ask_raw(data)

@@ -36,8 +36,15 @@ Stamp = Annotated[
 NameOrAll = Annotated[str, Meta(max_length=32, pattern=r"^(\*|[A-Za-z0-9][A-Za-z0-9_.+-]*)$")]
 
 
+Deadline = Annotated[
+    float, Meta(ge=0.0, le=1e12, description="CLOCK_MONOTONIC [s] until which the caller waits; refused when later")
+]
+
+
 class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="verb"):
     """A JSON object told apart by its `verb`."""
+
+    by_s: Deadline | None = None
 
 
 class Arm(_Message, tag="arm", frozen=True):
@@ -190,8 +197,10 @@ def request_of(
 ) -> Request:
     """Return what the tick gets; `orientation` says the tip's wxyz, for a goal that holds it. Raises RequestError.
 
-    now: as in `notices_of`.
+    now: as in `notices_of`; a request whose caller waits no more is refused.
     """
+    if not isinstance(message, CloudFrame) and message.by_s is not None and now > message.by_s:
+        raise RequestError(f"too late: the caller waited until {now - message.by_s:.1f} s ago")
     match message:
         case GoalMessage():
             return Request(goal=_goal_of(message, bounds, orientation))

@@ -31,11 +31,16 @@ FAULTS = (
     Fault("send_failed", 12, Severity.SS1, "R", "frames were dropped in many ticks running"),
     Fault("link_down", 13, Severity.SS1, "R", "the link is closed or gone"),
     Fault("log_degraded", 51, Severity.LOG, "A", "the log cannot be written; arming is refused"),
+    Fault("uplink_lost", 70, Severity.SS1, "R", "the vehicle is heard but answers nothing: it does not hear us"),
+    Fault("no_effect", 71, Severity.SS2, "R", "the vehicle does not do what it is asked for"),
+    Fault("gps_lost", 72, Severity.SS2, "A", "the vehicle's GPS has no fix: it reckons its position"),
+    Fault("scan_wrong", 73, Severity.SS2, "R", "the scan turns with or against the vehicle: its frame is wrong"),
 )
 INDEX = {fault.name: i for i, fault in enumerate(FAULTS)}
 BIT = {fault.name: 1 << i for i, fault in enumerate(FAULTS)}
 REFUSES_ARMING = ~(BIT["frames_refused"] | BIT["engage_refused"])
 _AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
+GPS_HOLD = 2.0  # [s] of reckoning, slowly, before the base holds: an EKF drifts by less than half a metre in it
 SEND_TICKS = 10  # a UDP stack drops one now and then
 
 
@@ -52,6 +57,8 @@ class Evidence(NamedTuple):
     goal_inside: bool
     feed_age: float  # [s]
     reboots: int  # as of the previous tick
+    no_effect: bool  # little came of what was asked for, for long
+    unfixed: float  # [s] without a GPS that there was
 
 
 class Counters(NamedTuple):
@@ -81,7 +88,7 @@ def detect(f: BaseFeedback, e: Evidence, c: Counters, p: SafetyParams) -> tuple[
         "position_jump": e.jump,
         "position_stale": age > p.position_hold,
         "position_lost": age > p.position_stop,
-        "scan_stale": p.scan and not f.scan_age <= p.scan_stale,
+        "scan_stale": p.scan and not f.known_age <= p.scan_stale,
         "feed_stale": e.feed_age > p.feed_timeout,
         "contact": e.contact and e.active,
         "goal_in_obstacle": e.goal_inside,
@@ -90,6 +97,10 @@ def detect(f: BaseFeedback, e: Evidence, c: Counters, p: SafetyParams) -> tuple[
         "send_failed": n.send_failed >= SEND_TICKS,
         "link_down": bool(f.link & Link.DOWN),
         "log_degraded": bool(f.link & Link.LOG_DEGRADED),
+        "uplink_lost": f.uplink_age > p.heartbeat_stop and f.heartbeat_age <= p.heartbeat_hold,
+        "no_effect": e.no_effect and e.active,
+        "gps_lost": e.unfixed > GPS_HOLD,
+        "scan_wrong": p.scan and f.scan_wrong,
     }
     return sum(BIT[name] for name, here in present.items() if here), n
 

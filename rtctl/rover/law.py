@@ -15,11 +15,12 @@ import numpy as np
 
 from rtctl.control.firas import firas
 from rtctl.kernel import kernel
+from rtctl.rover.occupancy import CELL, Chart, seen_ahead
 from rtctl.rover.robot import Base
 from rtctl.types import F64
 from rtctl.world.primitives import Obstacles, distances_into
 
-RESERVE = 0.4  # of the lag, for a vehicle that answers later than its config says
+RESERVE = 0.45  # of the lag, for a vehicle that answers later than its config says
 HORIZON = 30.0  # [m] that the governor looks ahead
 CREEP = 0.3  # [m/s] at which a car that cannot turn on the spot comes round
 
@@ -221,10 +222,27 @@ def allowed_speed(
     return v
 
 
+def seen_speed(base: Base, chart: Chart, x: F64, direction: F64, coming: float, tick: int) -> float:
+    """Return the speed [m/s] that can be braked to rest within what was seen free ahead of the hull; at most V_max.
+
+    coming [m]: the way that what was sent will still take. Space that was seen some time ago counts, for less: from
+    half of `seen` [s] on the speed falls with its age, so that the base rests by when it counts no more.
+    """
+    m, most = base.margins, base.limits.v_max
+    reach = most * m.lag + most**2 / (2.0 * m.brake) + max(coming, 0.0)
+    oldest = tick - round(base.safety.seen / base.dt)
+    gap, first = seen_ahead(chart, x, direction, m.hull, reach, oldest)
+    age = max(tick - first, 0) * base.dt / base.safety.seen
+    fades = most * min(2.0 - 2.0 * age, 1.0)
+    return min(max(fades, 0.0), spend(gap - 0.5 * CELL - max(coming, 0.0), m.brake, RESERVE * m.lag))
+
+
 def spend(gap: float, brake: float, lag: float) -> float:
     """Return the speed [m/s] from which `lag` [s] of it and braking at `brake` [m/s2] take `gap` [m]."""
     if gap <= 0.0:
         return 0.0
+    if math.isinf(gap):
+        return math.inf
     return -brake * lag + math.sqrt((brake * lag) ** 2 + 2.0 * brake * gap)
 
 

@@ -47,7 +47,7 @@ class BaseMemory(NamedTuple):
     world: World
     chart: Chart
     free: F64  # (SIZE, SIZE) [m] as of the last look for a way
-    scan: F64  # (m, 2) [m] returns of the last scan, in the world
+    scans: tuple[F64, ...]  # (m, 2) [m] returns of the last scan of each sensor, in the world
     way: Way
     due: int  # tick at which the way is looked for anew
     rho: F64  # (K,) [m] to each told obstacle
@@ -56,4 +56,10 @@ class BaseMemory(NamedTuple):
     v_ref: F64  # (2,) [m/s]
     v: float  # [m/s] last sent
     w: float  # [rad/s]
+    allowed_seen: float  # [m/s] by what was seen ahead
+    blind: int  # ticks that this has held the base
+    unfixed: float  # [s] without a GPS that there was
+    asked: F64  # (2,) [m/s, rad/s] twist that was asked for, as late as it takes effect, smoothed
+    did: F64  # (2,) the twist that came of it, smoothed alike
+    idle: F64  # (2,) [s] for which little of it came
     sent: F64  # (h, 2) the last twists [m/s, rad/s], newest first: what is still on its way to the wheels

@@ -1,8 +1,9 @@
 """What the range sensor has seen, kept: a window of cells that moves with the base, and the free distance in it.
 
 A single scan forgets the wall behind the corner; the way out of a dead end needs it. Cells hold evidence: a return
-sets it, a beam that passes takes it away again, so that what moved on is forgotten after a few looks. Everything is
-pure: editing returns new arrays.
+sets it, a beam that passes takes it away again, so that what moved on is forgotten after a few looks. Beside that a
+cell keeps when it was last seen free: seen, free and unknown are three things, and what nobody has looked at is not
+free. Everything is pure: editing returns new arrays.
 """
 
 import math
@@ -19,7 +20,9 @@ CELL = 0.35  # [m]
 SURE = 3  # looks through a cell that forget a return in it
 STENCIL = 12  # cells: free distances are told up to this many, and as this many beyond
 MARGIN = 24  # cells between the base and the window's edge before the window is moved
+NEVER = -(1 << 30)  # tick of a cell that was never seen free
 U8Grid = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
+I32Grid = np.ndarray[tuple[int, int], np.dtype[np.int32]]
 
 
 class Chart(NamedTuple):
@@ -27,11 +30,12 @@ class Chart(NamedTuple):
 
     cells: U8Grid  # (SIZE, SIZE) looks left before the return is forgotten
     origin: I64  # (2,) index of the lower corner in the world's own cells
+    seen: I32Grid  # (SIZE, SIZE) tick at which a beam passed last
 
 
 def empty(x: F64) -> Chart:
     """Return a chart without returns, centred on x (2,) [m]."""
-    return Chart(np.zeros((SIZE, SIZE), np.uint8), _corner(x))
+    return Chart(np.zeros((SIZE, SIZE), np.uint8), _corner(x), np.full((SIZE, SIZE), NEVER, np.int32))
 
 
 def _corner(x: F64) -> I64:
@@ -44,12 +48,13 @@ def moved(chart: Chart, x: F64) -> Chart:
     if bool((at >= MARGIN).all() and (at < SIZE - MARGIN).all()):
         return chart
     origin = _corner(x)
-    cells = np.zeros_like(chart.cells)
+    cells, seen = np.zeros_like(chart.cells), np.full_like(chart.seen, NEVER)
     shift = origin - chart.origin
     if bool((np.abs(shift) < SIZE).all()):
         (a, b), (c, d) = (_overlap(int(s)) for s in shift)
         cells[a[0] : a[1], c[0] : c[1]] = chart.cells[b[0] : b[1], d[0] : d[1]]
-    return Chart(cells, origin)
+        seen[a[0] : a[1], c[0] : c[1]] = chart.seen[b[0] : b[1], d[0] : d[1]]
+    return Chart(cells, origin, seen)
 
 
 def _overlap(shift: int) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -63,52 +68,114 @@ def shifted(chart: Chart, by: F64) -> Chart:
     return chart._replace(origin=chart.origin + np.round(by / CELL).astype(np.int64))
 
 
-def looked(chart: Chart, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float) -> Chart:
-    """Return the chart after one scan taken at x (2,) [m], yaw [rad].
+class Look(NamedTuple):
+    """One turn of a range sensor."""
 
-    scan (k,) [m] of sectors at body angles start + i step [rad], counter-clockwise; infinite: nothing up to `reach`
-    [m]; negative: unknown.
-    """
-    cells = chart.cells.copy()
-    _look(cells, chart.origin, x, yaw, scan, start, step, reach)
-    return chart._replace(cells=cells)
+    x: F64  # (2,) [m] of the sensor
+    angle: float  # [rad] of sector 0 in the world, counter-clockwise from east
+    step: float  # [rad] to the next sector
+    ranges: F64  # (k,) [m] infinite: nothing up to the reach; negative: unknown
+    reach: float  # [m]
+
+
+def looked(chart: Chart, look: Look, tick: int) -> Chart:
+    """Return the chart after one scan, taken in this tick."""
+    cells, seen = chart.cells.copy(), chart.seen.copy()
+    _look(cells, seen, chart.origin, look, tick)
+    return chart._replace(cells=cells, seen=seen)
 
 
 @kernel
-def _look(cells: U8Grid, origin: I64, x: F64, yaw: float, scan: F64, start: float, step: float, reach: float) -> None:
+def _look(cells: U8Grid, seen: I32Grid, origin: I64, look: Look, tick: int) -> None:
+    x, step, scan, reach = look.x, look.step, look.ranges, look.reach
     count, turn = scan.shape[0], 2.0 * math.pi
+    around = round(turn / abs(step))
     half = int(reach / CELL) + 1
     ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
     for i in range(max(0, ci - half), min(SIZE, ci + half + 1)):
         for j in range(max(0, cj - half), min(SIZE, cj + half + 1)):
-            if cells[i, j] == 0:
-                continue
             dx, dy = (origin[0] + i + 0.5) * CELL - x[0], (origin[1] + j + 0.5) * CELL - x[1]
             d = math.sqrt(dx * dx + dy * dy)
             if d > reach - CELL or d < CELL:
                 continue
-            angle = math.atan2(dy, dx) - yaw - start
+            angle = math.atan2(dy, dx) - look.angle
             wide = 0.7 * CELL / d  # every beam that touches the cell must have passed it
             first = math.floor((angle - wide) / step + 0.5)
             last = math.floor((angle + wide) / step + 0.5)
             if step < 0.0:
-                first, last = last, first
+                first, last = math.floor((angle + wide) / step + 0.5), math.floor((angle - wide) / step + 0.5)
             passed = True
             for k in range(first, last + 1):
-                at = k % round(turn / abs(step))
+                at = k % around
                 if at >= count or scan[at] < d + 0.7 * CELL:
                     passed = False
             if passed:
-                cells[i, j] -= 1
+                seen[i, j] = tick
+                if cells[i, j] > 0:
+                    cells[i, j] -= 1
     for k in range(count):
         d = scan[k]
         if d < 0.0 or d > reach:
             continue
-        angle = yaw + start + k * step
+        angle = look.angle + k * step
         i = math.floor((x[0] + d * math.cos(angle)) / CELL) - origin[0]
         j = math.floor((x[1] + d * math.sin(angle)) / CELL) - origin[1]
         if 0 <= i < SIZE and 0 <= j < SIZE:
             cells[i, j] = SURE
+
+
+def stood(chart: Chart, x: F64, radius: float, tick: int) -> Chart:
+    """Return the chart with the cells under a circle of `radius` [m] about x (2,) [m] seen: the base is there."""
+    seen = chart.seen.copy()
+    _stand(seen, chart.origin, x, radius, tick)
+    return chart._replace(seen=seen)
+
+
+@kernel
+def _stand(seen: I32Grid, origin: I64, x: F64, radius: float, tick: int) -> None:
+    half = int(radius / CELL) + 1
+    ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
+    for i in range(max(0, ci - half), min(SIZE, ci + half + 1)):
+        for j in range(max(0, cj - half), min(SIZE, cj + half + 1)):
+            dx, dy = (origin[0] + i + 0.5) * CELL - x[0], (origin[1] + j + 0.5) * CELL - x[1]
+            if dx * dx + dy * dy <= radius * radius:
+                seen[i, j] = tick
+
+
+def seen_ahead(chart: Chart, x: F64, e: F64, radius: float, reach: float, oldest: int) -> tuple[float, int]:
+    """Return how far [m] a circle of `radius` [m] about x (2,) can move along e before it comes to what is not seen.
+
+    A cell counts that a beam has passed in a tick after `oldest`, and one with a return in it: the governor keeps off
+    that by itself. With it the tick of the cell seen longest ago within `reach` [m]; infinite: all of it is seen.
+    """
+    gap, tick = _ahead(chart.cells, chart.seen, chart.origin, x, e, radius, reach, oldest)
+    return gap, tick
+
+
+@kernel
+def _ahead(
+    cells: U8Grid, seen: I32Grid, origin: I64, x: F64, e: F64, radius: float, reach: float, oldest: int
+) -> tuple[float, int]:
+    gap, first = math.inf, 1 << 30
+    half = int((reach + radius) / CELL) + 1
+    ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
+    for i in range(ci - half, ci + half + 1):
+        for j in range(cj - half, cj + half + 1):
+            dx, dy = (origin[0] + i + 0.5) * CELL - x[0], (origin[1] + j + 0.5) * CELL - x[1]
+            along, aside = dx * e[0] + dy * e[1], dy * e[0] - dx * e[1]
+            if along <= 0.0 or abs(aside) >= radius:
+                continue
+            s = along - math.sqrt(radius * radius - aside * aside)
+            if s > reach or s <= 0.0:
+                continue
+            if not (0 <= i < SIZE and 0 <= j < SIZE):
+                gap = min(gap, s)
+            elif cells[i, j] == 0:
+                if seen[i, j] <= oldest:
+                    gap = min(gap, s)
+                else:
+                    first = min(first, int(seen[i, j]))
+    return gap, first
 
 
 def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:

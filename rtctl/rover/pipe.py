@@ -9,7 +9,7 @@ import numpy as np
 
 from rtctl.kernel import reductions as scans
 from rtctl.rover import estimator, law, occupancy, path
-from rtctl.rover.faults import FAULTS, Counters, severity
+from rtctl.rover.faults import BIT, FAULTS, Counters, severity
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.record import make_base_record
 from rtctl.rover.robot import SECTORS, Base, Wheels
@@ -20,7 +20,15 @@ from rtctl.world import obstacle_table
 
 MISSED_MAX = 50  # slots that the estimate coasts through; more is a fault
 NEAR = 6.0  # [m] that returns are looked at around the base
+BEAM_TICKS = 5  # between two looks of the single sensors
+SLOW = 0.25  # of V_max while the position is reckoned, or the autopilot's own estimator is at its bound
+BLIND_SPEED = 0.1  # [m/s] below it the base stands for what it has not seen
+BLIND_TIME = 0.5  # [s] before that is a status
+SMOOTH = 1.0  # [s] over which asked and done are compared
+ASKED = np.array([0.3, 0.3])  # [m/s, rad/s] that must be asked for before it is asked what came of it
+LITTLE = 0.4  # of it
 PROGRESS = 0.3  # [m] by which the way must become shorter to count
+SIGHTLESS = BIT["scan_stale"] | BIT["scan_wrong"]
 Judged = tuple[F64, law.Push, F64, float]  # v_ref wanted, field, xd_d, allowed speed
 
 
@@ -31,6 +39,7 @@ def tick(
     m = memory._replace(tick=memory.tick + 1, verdict="")
     elapsed = base.dt * (1 + min(feedback.missed, MISSED_MAX))
     m = _estimated(base, m, feedback, elapsed)
+    m = _compared(base, m, elapsed)
     m = _perceived(base, m, feedback, request, elapsed)
     m, present = detected(base, m, feedback)
     m = supervised(base, m, feedback, request, present)
@@ -54,31 +63,41 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         verdict="", here=estimator.start(feedback.position, feedback.yaw, base.noise), innovation=0.0, unheard=0.0,
         jump=False, rest=0, last=feedback, goal=None, goal_rho=far, status=Status.NO_GOAL, blocker=-1, nearest=np.inf,
         still=0, world=table, chart=seen, free=occupancy.free_distance(seen, table.obstacles, base.margins.height),
-        scan=np.zeros((0, 2)), way=path.NO_WAY, due=0, rho=far, rho_seen=np.inf, v_ref=np.zeros(2), v=0.0, w=0.0,
+        scans=tuple(np.zeros((0, 2)) for _ in base.sensors), allowed_seen=0.0, blind=0, unfixed=0.0,
+        asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2), way=path.NO_WAY, due=0, rho=far, rho_seen=np.inf,
+        v_ref=np.zeros(2), v=0.0, w=0.0,
         sent=np.zeros((law.history(base), 2)),
     )  # fmt: skip
 
 
 def _estimated(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> BaseMemory:
-    """Where the base is at this slot; a report that speed cannot explain is a jump, and the frame moves with it."""
-    here = estimator.predicted(m.here, elapsed, base.noise)
-    here = here._replace(yaw=estimator.wrapped(f.yaw + f.attitude_age * f.yaw_rate), yaw_rate=f.yaw_rate)
+    """Where the base is at this slot; a report that speed cannot explain is a jump, and the frame moves with it.
+
+    Without reports the estimate coasts until the position counts as lost, then it rests where it is: what was seen
+    stays where it was, and the next report says how far the base went meanwhile.
+    """
     unheard, innovation, jump = m.unheard + elapsed, m.innovation, False
-    seen, points = m.chart, m.scan
+    lost = unheard > base.safety.position_stop
+    here = m.here._replace(v=np.zeros(2)) if lost else estimator.predicted(m.here, elapsed, base.noise)
+    here = here._replace(yaw=estimator.wrapped(f.yaw + f.attitude_age * f.yaw_rate), yaw_rate=f.yaw_rate)
+    seen, points = m.chart, m.scans
+    if f.reboots != m.last.reboots:  # another origin, perhaps: nothing of before has a place in it
+        seen, points = occupancy.empty(f.position), tuple(np.zeros((0, 2)) for _ in points)
     if f.fresh:
-        before = here
+        before, after = here, f.position + f.position_age * (f.velocity - here.b)
         here, innovation = estimator.measured(here, f.position, f.velocity, f.position_age, base.noise)
         jump = innovation > base.safety.jump + base.limits.v_max * unheard
         jump = jump or (f.reset != m.last.reset and innovation > base.safety.jump)
+        if jump or lost:
+            here = estimator.placed(before, after, f.velocity, base.noise)
         if jump:
-            here = estimator.start(f.position + f.position_age * f.velocity, here.yaw, base.noise)
-            here = here._replace(v=f.velocity.copy(), yaw_rate=f.yaw_rate)
-            seen, points = occupancy.shifted(seen, here.x - before.x), points + (here.x - before.x)
+            by = here.x - before.x
+            seen, points = occupancy.shifted(seen, by), tuple(p + by for p in points)
         unheard = 0.0
     still = math.hypot(*here.v) < 0.1 and abs(here.yaw_rate) < 0.1
     return m._replace(
-        here=here, unheard=unheard, innovation=innovation, jump=jump, chart=seen, scan=points,
-        rest=m.rest + 1 if still else 0,
+        here=here, unheard=unheard, innovation=innovation, jump=jump, chart=seen, scans=points,
+        rest=m.rest + 1 if still else 0, unfixed=m.unfixed + elapsed if f.fix_lost else 0.0,
     )  # fmt: skip
 
 
@@ -87,29 +106,41 @@ def _perceived(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, ela
     table, verdict = obstacle_table.advanced(m.world, elapsed), m.verdict
     if request.obstacles:
         table, verdict = obstacle_table.edited(table, request.obstacles)
-    seen, points, due = occupancy.moved(m.chart, m.here.x), m.scan, m.due
+    seen, scans, due = occupancy.moved(m.chart, m.here.x), m.scans, m.due
     if f.scans and f.scan_age < base.safety.scan_stale:
-        x, yaw = m.here.x - f.scan_age * m.here.v, m.here.yaw - f.scan_age * m.here.yaw_rate
-        reach = min(f.scan_reach, base.sense)
-        seen = occupancy.looked(seen, x, yaw, f.scan, f.scan_start, f.scan_step, reach)
-        points, due = _returns(x, yaw, f, reach), min(due, m.tick)
+        look = _look(base, m, f)
+        seen = occupancy.looked(seen, look, m.tick - round(f.scan_age / base.dt))
+        k = min(f.sensor, len(scans) - 1)
+        scans, due = (*scans[:k], _returns(look), *scans[k + 1 :]), min(due, m.tick)
+    if m.tick % BEAM_TICKS == 0 and (f.beams >= 0.0).any():
+        look = occupancy.Look(m.here.x, m.here.yaw, -0.25 * math.pi, f.beams, min(f.beam_reach, base.sense))
+        seen = occupancy.looked(seen, look, m.tick)
+    seen = occupancy.stood(seen, m.here.x, base.margins.hull, m.tick)
     rho = m.goal_rho if m.goal is None else goal_distance(base, table, m.goal)
-    return m._replace(world=table, verdict=verdict, chart=seen, scan=points, due=due, goal_rho=rho)
+    return m._replace(world=table, verdict=verdict, chart=seen, scans=scans, due=due, goal_rho=rho)
 
 
-def _returns(x: F64, yaw: float, f: BaseFeedback, reach: float) -> F64:
-    """Return the points (m, 2) [m] that a scan taken at x (2,), yaw touched."""
-    hit = (f.scan >= 0.0) & (f.scan <= reach)
-    angle = yaw + f.scan_start + f.scan_step * np.flatnonzero(hit)
-    points: F64 = x + f.scan[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def _look(base: Base, m: BaseMemory, f: BaseFeedback) -> occupancy.Look:
+    """Return the feedback's scan from where its sensor was when it was taken."""
+    x, yaw = m.here.x - f.scan_age * m.here.v, m.here.yaw - f.scan_age * m.here.yaw_rate
+    c, s = math.cos(yaw), math.sin(yaw)
+    at = x + np.array([c * f.scan_offset[0] - s * f.scan_offset[1], s * f.scan_offset[0] + c * f.scan_offset[1]])
+    return occupancy.Look(at, yaw + f.scan_start, f.scan_step, f.scan, min(f.scan_reach, base.sense))
+
+
+def _returns(look: occupancy.Look) -> F64:
+    """Return the points (m, 2) [m] that a scan touched."""
+    hit = (look.ranges >= 0.0) & (look.ranges <= look.reach)
+    angle = look.angle + look.step * np.flatnonzero(hit)
+    points: F64 = look.x + look.ranges[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return points
 
 
 def _surroundings(m: BaseMemory, f: BaseFeedback) -> tuple[F64, int]:
-    """Return every return (m, 2) [m] near the base, and how many are of the newest scan and single sensors: first."""
+    """Return every return (m, 2) [m] near the base, and how many are of the newest scans and single sensors: first."""
     x, yaw = m.here.x, m.here.yaw
-    parts = [m.scan]
-    hit = f.beams >= 0.0
+    parts = [*m.scans]
+    hit = (f.beams >= 0.0) & np.isfinite(f.beams)
     if hit.any():
         angle = yaw - 0.25 * np.pi * np.flatnonzero(hit)
         parts.append(x + f.beams[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -157,8 +188,38 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
         direction = sign * np.array([math.cos(yaw), math.sin(yaw)])
     coming = float((x - m.here.x) @ direction)
     allowed = law.allowed_speed(base, m.here.x, direction, coming, seen, m.world.obstacles, push)
-    m = m._replace(rho=push.rho, rho_seen=push.rho_seen)
-    return m, (v_ref, push, xd_d, allowed)
+    allowed = min(allowed, base.limits.v_max * _calm(f))
+    by_sight = base.limits.v_max
+    if base.safety.scan:
+        by_sight = law.seen_speed(base, m.chart, m.here.x, direction, coming, m.tick)
+        by_sight = min(by_sight, law.seen_speed(base, m.chart, x, direction, 0.0, m.tick))
+    waits = speed > 0.05 and by_sight < min(BLIND_SPEED, allowed)
+    m = m._replace(rho=push.rho, rho_seen=push.rho_seen, allowed_seen=by_sight, blind=m.blind + 1 if waits else 0)
+    return m, (v_ref, push, xd_d, min(allowed, by_sight))
+
+
+def _calm(f: BaseFeedback) -> float:
+    """Return the share of V_max that the position is good for."""
+    return SLOW if f.fix_lost else max(f.quality, SLOW)
+
+
+def _compared(base: Base, m: BaseMemory, elapsed: float) -> BaseMemory:
+    """Asked against done: twists as they should take effect now beside those that came, both smoothed alike.
+
+    Where less than LITTLE of what was asked for comes, time runs; `no_effect` is what it leads to.
+    """
+    if not driving(m):
+        return m._replace(asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2))
+    h = len(m.sent)
+    late = (min(round(base.margins.lag / base.dt), h) - 1, min(round(base.margins.turn_lag / base.dt), h) - 1)
+    due = np.array([m.sent[late[0], 0], m.sent[late[1], 1]])
+    along = m.here.v @ np.array([math.cos(m.here.yaw), math.sin(m.here.yaw)])
+    gain = min(elapsed / SMOOTH, 1.0)
+    asked, did = m.asked + gain * (due - m.asked), m.did + gain * (np.array([along, m.here.yaw_rate]) - m.did)
+    little = (np.abs(asked) > ASKED) & (did * np.sign(asked) < LITTLE * np.abs(asked))
+    if base.world_velocity:
+        little[1] = False  # its autopilot turns as it thinks best
+    return m._replace(asked=asked, did=did, idle=np.where(little, m.idle + elapsed, 0.0))
 
 
 def _ahead(base: Base, m: BaseMemory) -> tuple[F64, float]:
@@ -214,6 +275,8 @@ def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
     bound = m.goal.tolerance * (2.0 if m.status == Status.ARRIVED else 1.0)
     if error <= bound and (m.status == Status.ARRIVED or math.hypot(*m.here.v) < 0.3):
         return m._replace(status=Status.ARRIVED, blocker=-1, still=0)
+    if (m.blind * base.dt >= BLIND_TIME or m.in_force & SIGHTLESS) and math.hypot(*m.here.v) < 0.2:
+        return m._replace(status=Status.BLIND, blocker=-1)
     if m.still * base.dt < base.stall:
         return m._replace(status=Status.MOVING, blocker=-1)
     nearest = int(m.goal_rho.argmin())
@@ -238,13 +301,17 @@ def _record(
         tick=m.tick, slot=max(f.slot, 0), time=f.slot * base.dt, missed=f.missed, link=f.link, position=f.position,
         velocity=f.velocity, yaw=f.yaw, yaw_rate=f.yaw_rate, position_age=f.position_age, attitude_age=f.attitude_age,
         fresh=f.fresh, reset=f.reset, scan=f.scan, scan_start=f.scan_start, scan_step=f.scan_step,
-        scan_reach=f.scan_reach, scan_age=f.scan_age, scans=f.scans, beams=f.beams, heartbeat_age=f.heartbeat_age,
+        scan_reach=f.scan_reach, scan_age=f.scan_age, scans=f.scans, sensor=f.sensor, scan_offset=f.scan_offset,
+        scan_wrong=f.scan_wrong, known_age=f.known_age, beams=f.beams, beam_reach=f.beam_reach,
+        heartbeat_age=f.heartbeat_age, uplink_age=f.uplink_age, fix_lost=f.fix_lost, quality=f.quality,
         ours=f.ours, mode=f.mode, armed=f.armed, reboots=f.reboots, healthy=f.healthy, word=f.word, lost=f.lost,
         refused=f.refused, verb=request.verb, lateness=f.lateness, compute=f.compute,
         x=[*m.here.x, 0.0], xd=[*m.here.v, 0.0], heading=m.here.yaw, innovation=m.innovation, goal=goal,
         error=float(np.hypot(*(goal[:2] - m.here.x))), way=corners, corners=len(m.way.corners),
         way_length=m.way.length, way_short=m.way.short, rho=push.rho, push_told=push.told, rho_seen=push.rho_seen,
-        push_seen=push.seen, xd_d=xd_d, v_ref=v_ref, allowed=allowed, v=command.v, w=command.w,
+        push_seen=push.seen, xd_d=xd_d, v_ref=v_ref, allowed=allowed, allowed_seen=m.allowed_seen, bias=m.here.b,
+        asked=m.asked,
+        did=m.did, v=command.v, w=command.w,
         v_world=command.velocity, command=command.ask, state=m.state, status=m.status, blocker=m.blocker,
         severity=m.reaction, faults=m.in_force,
     )  # fmt: skip
@@ -256,8 +323,8 @@ def warm(base: Base) -> None:
     distances = np.full(SECTORS, np.inf)
     distances[:9] = 3.0
     f = f._replace(
-        slot=0, fresh=1, scan=distances, scan_reach=10.0, scan_age=0.05, scans=1, ours=True, armed=True,
-        beams=np.full(8, 2.0), word=int(Word.ACCEPTED),
+        slot=0, fresh=1, scan=distances, scan_reach=10.0, scan_age=0.05, known_age=0.05, scans=1, ours=True,
+        armed=True, beams=np.full(8, 2.0), beam_reach=5.0, word=int(Word.ACCEPTED),
     )  # fmt: skip
     far, upright = np.array([0.0, 0.0, 50.0]), np.array([1.0, 0.0, 0.0, 0.0])
     shape = Shape("warm", "sphere", np.array([0.1, 0.1, 0.1, 2.0]), far, upright, np.ones(3), np.zeros(3))

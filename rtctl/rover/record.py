@@ -21,8 +21,10 @@ def base_dtype(slots: int) -> "np.dtype[Any]":
             # what came in
             ("position", f, (2,)), ("velocity", f, (2,)), ("yaw", f), ("yaw_rate", f), ("position_age", f),
             ("attitude_age", f), ("fresh", i), ("reset", i), ("scan", f, (SECTORS,)), ("scan_start", f),
-            ("scan_step", f), ("scan_reach", f), ("scan_age", f), ("scans", i), ("beams", f, (8,)),
-            ("heartbeat_age", f), ("ours", u), ("mode", u), ("armed", u), ("reboots", u), ("healthy", u), ("word", i),
+            ("scan_step", f), ("scan_reach", f), ("scan_age", f), ("scans", i), ("sensor", i),
+            ("scan_offset", f, (2,)), ("scan_wrong", u), ("known_age", f), ("beams", f, (8,)), ("beam_reach", f),
+            ("heartbeat_age", f), ("uplink_age", f), ("fix_lost", u), ("quality", f),
+            ("ours", u), ("mode", u), ("armed", u), ("reboots", u), ("healthy", u), ("word", i),
             ("lost", u), ("refused", u), ("verb", u), ("lateness", f), ("compute", f),
             # estimate and task
             ("x", f, (3,)), ("xd", f, (3,)), ("heading", f), ("innovation", f), ("goal", f, (3,)), ("error", f),
@@ -30,7 +32,8 @@ def base_dtype(slots: int) -> "np.dtype[Any]":
             # obstacles
             ("rho", f, (slots,)), ("push_told", f, (slots, 2)), ("rho_seen", f), ("push_seen", f, (2,)),
             # command
-            ("xd_d", f, (2,)), ("v_ref", f, (2,)), ("allowed", f), ("v", f), ("w", f), ("v_world", f, (2,)),
+            ("xd_d", f, (2,)), ("v_ref", f, (2,)), ("allowed", f), ("allowed_seen", f), ("bias", f, (2,)),
+            ("asked", f, (2,)), ("did", f, (2,)), ("v", f), ("w", f), ("v_world", f, (2,)),
             ("command", u), ("state", u), ("status", u), ("blocker", i), ("severity", u), ("faults", "<u8"),
         ]
     )  # fmt: skip

@@ -52,6 +52,7 @@ class SafetyParams(NamedTuple):
     scan: bool  # a scan is required
     feed_timeout: float  # [s] of a moving obstacle's observation
     jump: float  # [m] beyond what speed explains, a position jumped
+    seen: float  # [s] for which a place that was seen free counts as free
 
 
 class Noise(NamedTuple):
@@ -88,3 +89,4 @@ class Base(NamedTuple):
     stall: float  # [s] without progress short of the goal before it is diagnosed
     engage: float  # [s] for mode and arming, then the request is given up
     sense: float  # [m] that a scan is believed up to
+    sensors: tuple[str, ...]  # range sensors by name

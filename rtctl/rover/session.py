@@ -21,6 +21,7 @@ REST_HOLD = 0.5  # [s] at rest before set-points end
 STOP_TIME = 6.0  # [s] after which a stop is believed over: no feedback says so
 HOLD_TIME = 3.0  # [s] for the autopilot to take its hold mode
 DISARM_TIME = 3.0  # [s] for it to disarm
+NO_EFFECT = 2.0  # [s] of little done; three times that where the autopilot turns before it drives
 REFUSALS = (Word.DENIED, Word.UNSUPPORTED, Word.FAILED, Word.NO_ANSWER)
 
 
@@ -49,6 +50,8 @@ def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, in
         goal_inside=m.goal is not None and reductions.any_below(m.goal_rho, 0.0),
         feed_age=obstacle_table.oldest(m.world),
         reboots=m.last.reboots,
+        no_effect=bool((m.idle > NO_EFFECT * (3.0 if base.world_velocity else 1.0)).any()),
+        unfixed=m.unfixed,
     )
     present, counters = faults.detect(f, evidence, m.counters, base.safety)
     # before it is ours to command, what is wrong with the vehicle is news, not a stop that somebody must reset
@@ -87,6 +90,8 @@ def _followed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> BaseM
         elapsed = (m.tick - m.since) * base.dt
         over = m.rest * base.dt >= REST_HOLD or elapsed >= STOP_TIME
         held = m.held or (m.reaction >= Severity.SS1 and over)
+        if held and not f.ours:
+            m = m._replace(entered=False)  # our own HOLD gave the mode away: nobody has taken it
         gone = bool(m.in_force & (BIT["mode_taken"] | BIT["disarmed"])) or (held and not f.ours)
         m = m._replace(held=held, off=gone or (held and elapsed >= STOP_TIME + HOLD_TIME))
     waiting = m.mine and f.armed and (m.tick - m.since) * base.dt < DISARM_TIME
@@ -135,7 +140,7 @@ def _entered(m: BaseMemory, state: State) -> BaseMemory:
     """Return the memory on entering a state: every motion begins from rest or from what is."""
     m = m._replace(
         state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False, held=False,
-        way=path.NO_WAY, nearest=np.inf,
+        way=path.NO_WAY, nearest=np.inf, blind=0, asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2),
     )  # fmt: skip
     if state == State.ARMED:
         m = m._replace(v_ref=np.zeros(2), v=0.0, w=0.0, entered=False, mine=False)

@@ -49,9 +49,17 @@ class BaseFeedback(NamedTuple):
     scan_step: float  # [rad] to the next sector; negative: clockwise
     scan_reach: float  # [m] that infinite stands for
     scan_age: float  # [s]
-    scans: int  # scans that came in this cycle
+    scans: int  # 1: a scan came in this cycle, of the sensor `sensor`
+    sensor: int  # that the scan is of, by its place in the config
+    scan_offset: F64  # (2,) [m] of that sensor, ahead and to the left of the origin
+    scan_wrong: bool  # a sensor's frame contradicts the vehicle's motion
+    known_age: float  # [s] of the newest scan or beam that knew anything
     beams: F64  # (8,) [m] of single sensors at 45 deg steps clockwise from front; negative: unknown or stale
+    beam_reach: float  # [m] that infinite stands for
     heartbeat_age: float  # [s]
+    uplink_age: float  # [s] since we sent the newest thing that the vehicle has answered
+    fix_lost: bool  # its GPS had a fix and has none
+    quality: float  # [0, 1] of its estimator, by its own variances; 1 calm
     ours: bool  # the mode is the one we command in
     mode: int  # custom_mode as it came
     armed: bool
@@ -79,7 +87,9 @@ def at_rest(position: F64, yaw: float) -> BaseFeedback:
     return BaseFeedback(
         slot=-1, missed=0, position=np.asarray(position, np.float64), velocity=np.zeros(2), yaw=yaw, yaw_rate=0.0,
         position_age=0.0, attitude_age=0.0, fresh=0, reset=0, scan=np.full(SECTORS, -1.0), scan_start=0.0,
-        scan_step=-2.0 * np.pi / SECTORS, scan_reach=0.0, scan_age=np.inf, scans=0, beams=np.full(8, -1.0),
-        heartbeat_age=0.0, ours=False, mode=0, armed=False, reboots=0, healthy=True, word=int(Word.PENDING), lost=0,
+        scan_step=-2.0 * np.pi / SECTORS, scan_reach=0.0, scan_age=np.inf, scans=0, sensor=0,
+        scan_offset=np.zeros(2), scan_wrong=False, known_age=np.inf, beams=np.full(8, -1.0), beam_reach=0.0,
+        heartbeat_age=0.0, uplink_age=0.0, fix_lost=False, quality=1.0,
+        ours=False, mode=0, armed=False, reboots=0, healthy=True, word=int(Word.PENDING), lost=0,
         refused=0, link=0, lateness=0.0, compute=0.0,
     )  # fmt: skip

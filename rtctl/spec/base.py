@@ -85,7 +85,9 @@ class BaseLink(Table, frozen=True, kw_only=True):
     vehicle_id: Annotated[Id, Meta(description="the vehicle's system id")] | None = (
         None  # None: the first autopilot heard
     )
-    handshake_s: Annotated[float, Meta(ge=1.0, le=120.0, description="the vehicle must have answered within")] = 15.0
+    handshake_s: (
+        Annotated[float, Meta(ge=1.0, le=3600.0, description="the vehicle must be there within; waits without")] | None
+    ) = None
 
 
 class BaseMotion(Table, frozen=True, kw_only=True):
@@ -110,6 +112,25 @@ class BaseAvoid(Table, frozen=True, kw_only=True):
     lookahead_s: Annotated[float, Meta(ge=0.0, le=5.0, description="closing speed widens the influence by this")] = 0.5
     scan: Annotated[Literal["required", "off"], Meta(description="required: no motion without a fresh scan")]
     range_m: Annotated[float, Meta(ge=0.5, le=30.0, description="returns further away are not believed")]
+    seen_s: Annotated[float, Meta(ge=0.2, le=30.0, description="what was seen free counts as free for this long")] = 2.0
+
+
+class Sensor(Table, frozen=True, kw_only=True):
+    """A range sensor: a component of its own on the vehicle's link, most often not the autopilot."""
+
+    name: Name
+    message: Literal["OBSTACLE_DISTANCE", "DISTANCE_SENSOR"] = "OBSTACLE_DISTANCE"
+    system: Annotated[Id, Meta(description="its system id; the vehicle's unless given")] | None = None
+    component: Annotated[Id, Meta(description="any, while only one speaks, unless given")] | None = None
+    yaw_rad: Annotated[
+        float, Meta(ge=-3.2, le=3.2, description="of its front, counter-clockwise from the vehicle's")
+    ] = 0.0
+    offset_m: Annotated[tuple[Metre, Metre], Meta(description="ahead and to the left of the origin")] = (0.0, 0.0)
+    frame: Annotated[
+        Literal["as sent", "body", "north"], Meta(description="of its angles; senders leave `frame` wrong often")
+    ] = "as sent"
+    min_m: Annotated[float, Meta(ge=0.0, le=5.0, description="nearer it measures nothing")] = 0.0
+    max_m: Annotated[float, Meta(ge=0.5, le=100.0, description="further it measures nothing")] = 100.0
 
 
 class BaseEstimator(Table, frozen=True, kw_only=True):
@@ -148,6 +169,7 @@ class BaseConfig(Table, frozen=True, kw_only=True):
     estimator: BaseEstimator = BaseEstimator()
     console: ConsoleTable = ConsoleTable()
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
+    sensor: Annotated[tuple[Sensor, ...], Meta(max_length=4, description="any one scan and any beams if none")] = ()
 
 
 def is_base(path: str | Path) -> bool:

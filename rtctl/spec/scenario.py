@@ -53,6 +53,11 @@ class FaultTable(Table, frozen=True, kw_only=True):
     kind: Name
     duration_s: Annotated[float, Meta(ge=0.0, le=3600.0, description="0 lasts")] = 0.0
     joint: Annotated[int, Meta(ge=-1, le=14, description="index, -1 is all")] | Key = -1
+    from_deg: Annotated[
+        float, Meta(ge=-360.0, le=360.0, description="of a range sensor, clockwise from the front")
+    ] = -180.0
+    to_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] = 180.0
+    value: Annotated[float, Meta(ge=-1e4, le=1e4, description="how much, where the kind has a size")] | None = None
 
 
 class Scenario(Table, frozen=True, kw_only=True):

@@ -8,6 +8,7 @@ import math
 import os
 import struct
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +16,9 @@ import numpy as np
 os.environ["MAVLINK20"] = "1"  # before pymavlink is imported: it starts as MAVLink 1 otherwise
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from rtctl.errors import HandshakeError
+from rtctl.errors import AbsentError, HandshakeError, StoppedError
 from rtctl.hal.mavlink.keys import Keys
+from rtctl.hal.mavlink.ranging import SensorSpec
 from rtctl.hal.mavlink.talk import Order, Talk, request, stream
 from rtctl.hal.mavlink.view import View, enu, local_of
 from rtctl.hal.mavlink.wire import Address, Wire
@@ -24,7 +26,7 @@ from rtctl.protocol import signing
 from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word
 
 HEARTBEAT = 1.0  # [s] between ours
-TIMESYNC = 1.0  # [s]
+TIMESYNC = 0.5  # [s]
 SILENT = 1.0  # [s] without a position from a vehicle that is there: its streams are asked for anew
 TIMESYNC_FAST = 0.1  # [s] until clocks are agreed
 PRESTREAM = 1.3  # [s] of set-points before PX4 may be asked for OFFBOARD: it wants more than one
@@ -35,6 +37,11 @@ VELOCITY_YAW_RATE = 0x05C7  # of SET_POSITION_TARGET_LOCAL_NED: velocity and yaw
 VELOCITY = 0x0DC7  # velocity alone
 LOCAL_NED, BODY_NED = 1, 8
 NEWS = 200  # lines kept
+BACKLOG = 100_000  # frames of the handshake that are kept for the log
+SETTLE, FRESH = 2.0, 0.1  # [s] for the state of now after the handshake; what counts as that
+PROGRESS = 5.0  # [s] between two lines on what is waited for
+ORIGIN = 3.0  # [s] between two questions for the origin, while it is not known
+ASKING = 8.0  # [s] after which settings that the vehicle does not tell are waited for no more
 
 
 class Stack(NamedTuple):
@@ -59,8 +66,12 @@ STACKS = {
 STREAMS = {  # name -> (message id, Hz)
     "LOCAL_POSITION_NED": (32, 50.0), "ATTITUDE": (30, 50.0), "ODOMETRY": (331, 50.0), "OBSTACLE_DISTANCE": (330, 10.0),
     "DISTANCE_SENSOR": (132, 10.0), "EKF_STATUS_REPORT": (193, 10.0), "ESTIMATOR_STATUS": (230, 10.0),
+    "GPS_RAW_INT": (24, 5.0), "GLOBAL_POSITION_INT": (33, 2.0), "HOME_POSITION": (242, 1.0),
 }  # fmt: skip
-ONLY = {"ardupilot": ("ODOMETRY", "ESTIMATOR_STATUS"), "px4": ("EKF_STATUS_REPORT", "LOCAL_POSITION_NED")}  # left out
+ONLY = {  # left out
+    "ardupilot": ("ODOMETRY", "ESTIMATOR_STATUS", "OBSTACLE_DISTANCE"),
+    "px4": ("EKF_STATUS_REPORT", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "HOME_POSITION"),
+}
 ROVERS = (10, 11)  # MAV_TYPE: ground rover, surface boat
 
 
@@ -73,8 +84,9 @@ class MavSpec(NamedTuple):
     component: int
     vehicle: int | None
     period: float  # [s]
-    timeout: float  # [s] of the handshake
+    timeout: float  # [s] that the handshake waits for what is not there yet; infinite: for ever
     scan: bool  # a scan is required
+    sensors: tuple[SensorSpec, ...]
 
 
 class MavLink:
@@ -84,7 +96,7 @@ class MavLink:
         self.spec, self.wire, self.keys = spec, wire, keys
         self.stack = STACKS[spec.autopilot]
         self.news: deque[str] = deque(maxlen=NEWS)  # what people should read: refusals, texts of the vehicle
-        self.view = View(self.news.append)
+        self.view = View(self.news.append, spec.sensors, spec.autopilot)
         self.talk = Talk()
         self.received: list[bytes] = []  # frames of this cycle as they came
         self.vehicle: tuple[int, int] | None = None  # pinned (system, component)
@@ -100,22 +112,38 @@ class MavLink:
         self._word = Word.PENDING
         self._reboots = 0
         self._subscribed = math.inf  # [s] when streams were asked for
+        self._backlog: deque[bytes] = deque(maxlen=BACKLOG)  # of the handshake, until the loop's first read
+        self._origin_asked = math.inf  # [s]
+        self._strangers: set[tuple[int, int]] = set()
 
     # -- reading -------------------------------------------------------------------------------------------------
 
     def read(self, slot: int, missed: int, lateness: float, compute: float) -> BaseFeedback:
-        """Return what is known of the vehicle at this slot."""
+        """Return what is known of the vehicle at this slot; the loop's first has all packets since the start."""
         self._drain()
+        if slot < 0:
+            self._backlog.extend(self.received)
+        elif self._backlog:
+            self.received = [*self._backlog, *self.received]
+            self._backlog.clear()
         now, v = self.wire.now(), self.view
+        v.ranging.next()
+        scan, seen = v.ranging.scan, v.ranging
+        sensor = seen.specs[scan.sensor]
         silent = now - v.position_at > SILENT and now - v.heartbeat_at < HEARTBEAT + 1.0
         if v.reboots != self._reboots or (silent and self.talk.idle and self._subscribed < now - SILENT):
             self._reboots = v.reboots
             self._subscribe()
+        elif v.origin is None and self.talk.idle and now - self._origin_asked > ORIGIN:
+            self._ask_for_origin(now)
         return BaseFeedback(
             slot=slot, missed=missed, position=v.position, velocity=v.velocity, yaw=v.yaw, yaw_rate=v.yaw_rate,
             position_age=now - v.position_at, attitude_age=now - v.attitude_at, fresh=v.fresh, reset=v.reset,
-            scan=v.scan, scan_start=v.scan_start, scan_step=v.scan_step, scan_reach=v.scan_reach,
-            scan_age=now - v.scan_at, scans=v.scans, beams=v.beams_now(now), heartbeat_age=now - v.heartbeat_at,
+            scan=scan.ranges, scan_start=scan.start, scan_step=scan.step, scan_reach=scan.reach,
+            scan_age=now - scan.at, scans=seen.fresh, sensor=scan.sensor, scan_offset=np.array(sensor.offset),
+            scan_wrong=seen.wrong, known_age=now - seen.known_at, beams=seen.beams_now(now),
+            beam_reach=seen.beam_reach, heartbeat_age=now - v.heartbeat_at,
+            uplink_age=0.0 if math.isnan(v.uplink_at) else now - v.uplink_at, fix_lost=v.fix_lost, quality=v.quality,
             ours=v.mode == self.stack.ours, mode=max(v.mode, 0), armed=v.armed, reboots=v.reboots, healthy=v.healthy,
             word=int(self._word), lost=self._lost, refused=self._refused, link=self.wire.flags(), lateness=lateness,
             compute=compute,
@@ -151,20 +179,31 @@ class MavLink:
         source = (frame.system, frame.component)
         if self.vehicle is None:
             self._discover(message, source, address)
-        if source != self.vehicle:
-            self._count("of others", 1)
+        if self.vehicle is None or source != self.vehicle:
+            if self.vehicle is None or not self.view.sensed(message, source, self.vehicle[0], now):
+                self._count("of others", 1)
             return
         if address is not None:
             self.wire.pin(address)
         self._sequence(frame.sequence)
         if message.get_type() == "COMMAND_ACK":
-            if message.target_system in (0, self.spec.system) and message.target_component in (0, self.spec.component):
-                self.talk.answer(int(message.command), int(message.result), now)
+            self._acknowledged(message, now)
+            return
+        if self.view.sensed(message, source, source[0], now):
             return
         self.view.take(message, now)
 
+    def _acknowledged(self, message: Any, now: float) -> None:
+        """Take a COMMAND_ACK that is for us."""
+        for_us = message.target_system in (0, self.spec.system) and message.target_component in (0, self.spec.component)
+        if for_us and self.talk.answer(int(message.command), int(message.result), now):
+            self.view.answered(now)
+
     def _discover(self, message: Any, source: tuple[int, int], address: Address) -> None:
-        """Pin the vehicle by its heartbeat. HandshakeError when it is not what the config says."""
+        """Pin the vehicle by its heartbeat; others are passed over, and told of once.
+
+        HandshakeError when the one that the config names by its id is another kind than it says: a file can cure that.
+        """
         spec = self.spec
         if message.get_type() != "HEARTBEAT" or message.autopilot == 8 or source[1] != AUTOPILOT1:
             return
@@ -173,12 +212,21 @@ class MavLink:
         if message.autopilot != self.stack.autopilot:
             names = {stack.autopilot: name for name, stack in STACKS.items()}
             got = names.get(message.autopilot, f"autopilot type {message.autopilot}")
-            raise HandshakeError(f"{spec.place}: link.autopilot", f"a heartbeat of {got}", spec.autopilot)
+            if spec.vehicle is not None:
+                raise HandshakeError(f"{spec.place}: link.autopilot", f"a heartbeat of {got}", spec.autopilot)
+            self._pass_over(source, got)
+            return
         if message.type not in ROVERS:
-            raise HandshakeError(f"{spec.place}: link.url", f"a vehicle of MAV_TYPE {message.type}", "a ground rover")
+            self._pass_over(source, f"a vehicle of MAV_TYPE {message.type}")
+            return
         self.vehicle = source
         if address is not None:
             self.wire.pin(address)
+
+    def _pass_over(self, source: tuple[int, int], what: str) -> None:
+        if source not in self._strangers:
+            self._strangers.add(source)
+            self.news.append(f"{source} is {what}: passed over, an {self.spec.autopilot} rover is waited for")
 
     def _sequence(self, sequence: int) -> None:
         """Count messages that did not come within a window of later ones; one that is late is no loss."""
@@ -308,37 +356,64 @@ class MavLink:
 
     # -- the start -----------------------------------------------------------------------------------------------
 
-    def handshake(self) -> BaseFeedback:
-        """Find the vehicle, ask for its streams and read its parameters; HandshakeError when it stays silent.
+    def handshake(
+        self, say: Callable[[str], None] | None = None, ended: Callable[[], bool] = lambda: False
+    ) -> BaseFeedback:
+        """Find the vehicle, ask for its streams and settings, and wait for what is not there yet.
 
-        Nothing is armed and no mode is changed here.
+        say: is told what is waited for. ended: whether to give up. Nothing is armed and no mode is changed here.
+        Raises HandshakeError for what a file can cure, AbsentError after `timeout`, StoppedError.
         """
-        idle = BaseCommand(Ask.SILENCE, 0.0, 0.0, _ZERO)
-        begun, subscribed, asked, asked_at = self.wire.now(), False, 0, 0.0
-        names = list(self.stack.parameters)
+        begun = self.wire.now()
+        told, names = begun, list(self.stack.parameters)
+        asked, asked_at, subscribed = 0, begun, False
         while True:
             feedback = self.read(-1, 0, 0.0, 0.0)
             now = self.wire.now()
             if self.vehicle is not None and not subscribed:
                 self._subscribe()
                 subscribed, asked_at = True, now
-            self.write(idle)
-            if self.vehicle is not None and subscribed and asked < 2 * len(names) and now >= asked_at:
-                asked_at = now + 0.1  # a parameter takes about that long
-                name = names[asked % len(names)]
-                asked += 1
-                if name not in self.view.parameters:
-                    self._send(self._mav.param_request_read_encode(*self.vehicle, name.encode(), -1))
+            self.write(_IDLE)
+            if subscribed and asked < 2 * len(names) and now >= asked_at:
+                asked, asked_at = asked + 1, now + 0.1  # a parameter takes about that long
+                self._ask_parameter(names[(asked - 1) % len(names)])
             missing = self._missing(feedback, subscribed)
-            if not missing and asked >= 2 * len(names) and self.talk.idle:
+            settled = asked >= 2 * len(names) and (self.talk.idle or now - begun > ASKING)
+            if missing is None and settled:
                 break
-            if now - begun > self.spec.timeout:
-                if missing:
-                    raise HandshakeError(f"{self.spec.place}: link.url", missing[0], missing[1])
-                break
+            if ended():
+                raise StoppedError(f"{self.spec.place}: stopped while it waited for the vehicle")
+            if missing is not None and now - begun > self.spec.timeout:
+                raise AbsentError(f"{self.spec.place}: link.url: got {missing[0]}, wanted {missing[1]}")
+            if missing is not None and say is not None and now - told >= PROGRESS:
+                told = now
+                say(f"waiting since {now - begun:.0f} s: {missing[0]}, wanted {missing[1]}{self._last_words()}")
             self.wire.rest(self.spec.period)
         self._report()
         return feedback
+
+    def settle(self) -> None:
+        """Take all that came since the handshake, so that the loop begins with the state of now.
+
+        A socket that nobody reads keeps what came first: what is of now may have to be waited for.
+        """
+        until = self.wire.now() + SETTLE
+        while True:
+            f = self.read(-1, 0, 0.0, 0.0)
+            self.write(_IDLE)
+            if f.position_age < FRESH or self.wire.now() > until:
+                break
+            if not self.received:
+                self.wire.rest(self.spec.period)
+        self.view.uplink_at = math.nan  # nothing was asked meanwhile
+
+    def _last_words(self) -> str:
+        return f" ({self.news[-1]})" if self.news else ""
+
+    def _ask_parameter(self, name: str) -> None:
+        assert self.vehicle is not None
+        if name not in self.view.parameters:
+            self._send(self._mav.param_request_read_encode(*self.vehicle, name.encode(), -1))
 
     def _send(self, message: Any) -> None:
         self.wire.send([self.keys.signed(bytes(message.pack(self._mav)), message.crc_extra)])
@@ -351,6 +426,14 @@ class MavLink:
             if name not in left_out:
                 self.talk.drop((name,))
                 self.talk.give(stream(name, message, rate))
+        self.talk.drop(("AUTOPILOT_VERSION",))
+        self.talk.give(request("AUTOPILOT_VERSION", 148))
+        self._ask_for_origin(self._subscribed)
+
+    def _ask_for_origin(self, now: float) -> None:
+        """Ask where on Earth (0, 0) is; an autopilot without a position refuses, so it is asked again."""
+        self._origin_asked = now
+        self.talk.drop(("GPS_GLOBAL_ORIGIN",))
         self.talk.give(request("GPS_GLOBAL_ORIGIN", 49))
 
     def _missing(self, f: BaseFeedback, found: bool) -> tuple[str, str] | None:
@@ -360,8 +443,8 @@ class MavLink:
             return heard, f"the heartbeat of an {self.spec.autopilot} rover"
         if not (f.position_age < 1.0 and f.attitude_age < 1.0):
             return "no position or attitude", "LOCAL_POSITION_NED or ODOMETRY, and ATTITUDE"
-        if self.spec.scan and not f.scan_age < 1.0:
-            return "no OBSTACLE_DISTANCE", 'a range sensor, or avoid.scan = "off"'
+        if self.spec.scan and not f.known_age < 1.0:
+            return "no range sensor's OBSTACLE_DISTANCE or DISTANCE_SENSOR", 'a range sensor, or avoid.scan = "off"'
         return None
 
     def _report(self) -> None:
@@ -377,7 +460,7 @@ class MavLink:
 
     def local(self, latitude: float, longitude: float) -> tuple[float, float] | None:
         """Return (east, north) [m] of a place [deg]; None while the vehicle's origin is not known."""
-        origin = self.view.origin
+        origin = self.view.home if self.view.relative_to_home else self.view.origin
         return None if origin is None else local_of(origin, latitude, longitude, self.spec.autopilot)
 
     def close(self) -> None:
@@ -387,3 +470,4 @@ class MavLink:
 
 
 _ZERO = np.zeros(2)
+_IDLE = BaseCommand(Ask.SILENCE, 0.0, 0.0, _ZERO)

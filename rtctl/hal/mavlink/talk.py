@@ -77,26 +77,27 @@ class Talk:
         self._due = now + PATIENCE
         return self._order, self._tries - 1
 
-    def answer(self, command: int, result: int, now: float) -> None:
-        """Take a COMMAND_ACK of the vehicle."""
+    def answer(self, command: int, result: int, now: float) -> bool:
+        """Take a COMMAND_ACK of the vehicle; return whether it answers what is in flight."""
         order = self._order
         if order is None or command != order.command or self._tries == 0:
-            return
+            return False
         if result == IN_PROGRESS:
             self._due = now + 10.0 * PATIENCE
-            return
+            return True
         word = WORDS.get(result, Word.FAILED)
         if word == Word.BUSY and self._busy < BUSY_TRIES:
             self._busy, self._tries, self._due = self._busy + 1, self._tries - 1, now + PAUSE
-            return
+            return True
         if word in (Word.DENIED, Word.FAILED) and len(order.rates) > 1:
             slower = order.rates[1:]
             self._order = order._replace(rates=slower, parameters=interval(order.parameters[0], slower[0]))
             self._tries, self._busy, self._due = 0, 0, now
-            return
+            return True
         if word == Word.ACCEPTED and order.rates:
             self.rates[order.name] = order.rates[0]
         self._end(word)
+        return True
 
     def _end(self, word: Word) -> None:
         assert self._order is not None

@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from rtctl.hal.mavlink.ranging import Pose, Ranging, SensorSpec
 from rtctl.rover.estimator import wrapped
-from rtctl.rover.robot import SECTORS
 
 REBOOT = 2.0  # [s] by which time since boot must fall: messages that overtake each other are late by less
 ROUND_TRIPS = 10  # kept of TIMESYNC
 STEP = 0.25  # [s] that the vehicle's clock may differ from what was agreed, before it is agreed anew
-NOTHING, UNKNOWN = math.inf, -1.0
-BEAM_STALE = 0.5  # [s]
+HOME_APART = 0.5  # [m] between home and origin from which it is seen what the local position is relative to
+HOME_LOOKS = 5  # at both
+GOOD_FIX = 3  # of GPS_RAW_INT: three dimensions
+CALM_VARIANCE, CALM_RATIO = 0.4, 0.5  # of the autopilot's estimator: below it there is nothing to be slow for
 BODY_FRAMES = (8, 9, 12)
 METRES = {"ardupilot": 111318.84502145034, "px4": 6371000.0 * math.pi / 180.0}  # a degree, as each autopilot projects
 GOOD_EKF = 1 | 2  # attitude and horizontal velocity
@@ -69,16 +71,21 @@ class Clock:
 class View:
     """The newest state of the vehicle; `take` is given every message that passed all checks."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self.say = say
+    def __init__(self, say: Callable[[str], None], sensors: tuple[SensorSpec, ...], autopilot: str) -> None:
+        self.say, self.autopilot = say, autopilot
+        self.ranging = Ranging(sensors, say)
         self.clock = Clock()
         self.position, self.velocity = np.zeros(2), np.zeros(2)
-        self.position_at = self.attitude_at = self.scan_at = self.heartbeat_at = -math.inf
+        self.position_at = self.attitude_at = self.heartbeat_at = -math.inf
+        self.uplink_at = math.nan  # [s] when we sent the newest thing that the vehicle has answered
+        self.quality = 1.0  # of its estimator, by its own variances: 1 calm, 0 at its own failsafe's threshold
+        self.fix = -1  # of its GPS; negative: it told of none
+        self.fixed = False  # it has had one
+        self.firmware: tuple[int, int, int] | None = None
+        self.home: tuple[float, float] | None = None  # [deg]
+        self.relative_to_home = False  # the local position is, as firmware before 4.1 tells it
         self.yaw = self.yaw_rate = 0.0
-        self.fresh = self.scans = self.reset = 0
-        self.scan = np.full(SECTORS, UNKNOWN)
-        self.scan_start, self.scan_step, self.scan_reach = 0.0, -2.0 * math.pi / SECTORS, 0.0
-        self.beams, self.beams_at = np.full(8, UNKNOWN), np.full(8, -math.inf)
+        self.fresh = self.reset = 0
         self.mode, self.armed, self.healthy = -1, False, False
         self.reboots = 0
         self.origin: tuple[float, float] | None = None  # [deg] latitude, longitude of (0, 0)
@@ -89,16 +96,26 @@ class View:
         self._newest: dict[str, float] = {}
         self._text: dict[int, dict[int, str]] = {}
         self._odometry = False
+        self._home_looks = 0
         self._handlers: dict[str, Callable[[Any, float], None]] = {
             "HEARTBEAT": self._heartbeat, "LOCAL_POSITION_NED": self._local, "ODOMETRY": self._odometry_ned,
             "ATTITUDE": self._attitude, "EKF_STATUS_REPORT": self._ekf, "ESTIMATOR_STATUS": self._estimator,
-            "OBSTACLE_DISTANCE": self._obstacles, "DISTANCE_SENSOR": self._beam, "STATUSTEXT": self._status_text,
+            "STATUSTEXT": self._status_text, "GPS_RAW_INT": self._gps, "GLOBAL_POSITION_INT": self._global,
+            "HOME_POSITION": self._home, "AUTOPILOT_VERSION": self._version,
             "PARAM_VALUE": self._parameter, "GPS_GLOBAL_ORIGIN": self._global_origin, "TIMESYNC": self._timesync,
         }  # fmt: skip
 
     def cycle(self) -> None:
         """Begin a cycle: nothing has come in it yet."""
-        self.fresh = self.scans = 0
+        self.fresh = 0
+        self.ranging.cycle()
+
+    def sensed(self, message: Any, source: tuple[int, int], vehicle: int, now: float) -> bool:
+        """Take a range sensor's message of any component; return whether it is one that is listened to."""
+        if not self.ranging.wants(message.get_type()):
+            return False
+        stamp = self.clock.ours(1e-6 * message.time_usec, now) if message.get_type() == "OBSTACLE_DISTANCE" else now
+        return self.ranging.take(message, source, vehicle, Pose(self.position, self.yaw), stamp, now)
 
     def take(self, message: Any, now: float) -> None:
         """Take a message of the vehicle that came at `now` [s]."""
@@ -115,6 +132,7 @@ class View:
             self.say("the autopilot started anew")
             self.reboots += 1
             self.clock, self._newest, self._boot, self._fallen = Clock(), {}, -math.inf, 0
+            self.fix, self.fixed, self.uplink_at = -1, False, math.nan
             self.healthy = False
         elif boot >= self._boot:
             self._fallen, self._boot = 0, boot
@@ -122,6 +140,10 @@ class View:
             return False
         self._newest[kind] = boot
         return True
+
+    def answered(self, sent: float) -> None:
+        """Take it that the vehicle has heard what we sent at `sent` [s]."""
+        self.uplink_at = sent if math.isnan(self.uplink_at) else max(self.uplink_at, sent)
 
     def _heartbeat(self, m: Any, now: float) -> None:
         self.heartbeat_at, self.mode, self.armed = now, int(m.custom_mode), bool(m.base_mode & 128)
@@ -155,39 +177,50 @@ class View:
             self.yaw, self.yaw_rate, self.attitude_at = enu_yaw(m.yaw), -m.yawspeed, self.clock.ours(boot, now)
 
     def _ekf(self, m: Any, now: float) -> None:
-        calm = max(m.velocity_variance, m.pos_horiz_variance, m.compass_variance) < EKF_VARIANCE
-        self.healthy = _usable(m.flags) and calm
+        worst = max(m.velocity_variance, m.pos_horiz_variance, m.compass_variance)
+        self.healthy = _usable(m.flags) and worst < EKF_VARIANCE
+        self.quality = _calm(worst, CALM_VARIANCE, EKF_VARIANCE)
 
     def _estimator(self, m: Any, now: float) -> None:
-        self.healthy = _usable(m.flags) and max(m.vel_ratio, m.pos_horiz_ratio) < RATIO
+        worst = max(m.vel_ratio, m.pos_horiz_ratio)
+        self.healthy = _usable(m.flags) and worst < RATIO
+        self.quality = _calm(worst, CALM_RATIO, RATIO)
 
-    def _obstacles(self, m: Any, now: float) -> None:
-        """72 sectors clockwise from angle_offset; max + 1 is nothing there, 65535 unknown."""
-        increment = math.radians(m.increment_f if m.increment_f != 0.0 else m.increment)
-        offset = math.radians(m.angle_offset)
-        if not _finite(increment, offset) or increment == 0.0:
+    def _gps(self, m: Any, now: float) -> None:
+        self.fix = int(m.fix_type)
+        self.fixed = self.fixed or self.fix >= GOOD_FIX
+
+    @property
+    def fix_lost(self) -> bool:
+        """Return whether a GPS that had a fix has none: the autopilot reckons on and says so seconds later."""
+        return self.fixed and 0 <= self.fix < GOOD_FIX
+
+    def _home(self, m: Any, now: float) -> None:
+        self.home = (1e-7 * m.latitude, 1e-7 * m.longitude)
+
+    def _global(self, m: Any, now: float) -> None:
+        """Notice what LOCAL_POSITION_NED is relative to: old firmware tells it from home, which moves."""
+        if self.origin is None or self.home is None or self._odometry:
             return
-        raw = np.array(m.distances[:SECTORS], np.float64)
-        count = min(SECTORS, int(2.0 * math.pi / abs(increment) + 1e-6))
-        scan = np.full(SECTORS, UNKNOWN)
-        scan[:count] = np.where(raw > m.max_distance, NOTHING, 0.01 * raw)[:count]
-        scan[:count][raw[:count] == 65535] = UNKNOWN
-        start = -offset if m.frame in BODY_FRAMES else enu_yaw(offset) - self.yaw
-        self.scan, self.scan_start, self.scan_step = scan, start, -increment
-        self.scan_reach = 0.01 * m.max_distance
-        age = now - self.clock.ours(1e-6 * m.time_usec, now)
-        self.scan_at = now - (age if age < 2.0 else 0.0)  # a sensor's driver may stamp with another clock
-        self.scans += 1
+        place = (1e-7 * m.lat, 1e-7 * m.lon)
+        by_origin, by_home = (
+            np.array(local_of(zero, *place, self.autopilot)) - self.position for zero in (self.origin, self.home)
+        )
+        apart = float(np.hypot(*(by_origin - by_home)))
+        if apart < HOME_APART:
+            return
+        from_home = bool(np.hypot(*by_home) < 0.3 * apart)
+        self._home_looks = self._home_looks + 1 if from_home != self.relative_to_home else 0
+        if self._home_looks >= HOME_LOOKS:
+            self.relative_to_home, self._home_looks = from_home, 0
+            self.say(f"LOCAL_POSITION_NED is relative to {'home, which moves' if from_home else 'the origin'}")
 
-    def _beam(self, m: Any, now: float) -> None:
-        if m.orientation < 8 and m.signal_quality != 1:
-            there = m.min_distance <= m.current_distance < m.max_distance
-            self.beams[m.orientation] = 0.01 * m.current_distance if there else UNKNOWN
-            self.beams_at[m.orientation] = now
-
-    def beams_now(self, now: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Return the single sensors' ranges (8,) [m], unknown where stale."""
-        return np.where(now - self.beams_at <= BEAM_STALE, self.beams, UNKNOWN)
+    def _version(self, m: Any, now: float) -> None:
+        v = int(m.flight_sw_version)
+        firmware = (v >> 24 & 0xFF, v >> 16 & 0xFF, v >> 8 & 0xFF)
+        if firmware != self.firmware:
+            self.firmware = firmware
+            self.say(f"firmware {'.'.join(map(str, firmware))}" + _implied(self.autopilot, firmware))
 
     def _status_text(self, m: Any, now: float) -> None:
         """Texts come in chunks of 50 bytes, joined by their id."""
@@ -213,8 +246,22 @@ class View:
     def _timesync(self, m: Any, now: float) -> None:
         if m.tc1 > 0 and m.ts1 in self.asked:  # an answer to ours: ts1 is what we sent
             self.asked.remove(m.ts1)
+            self.answered(1e-9 * m.ts1)
             self._in_order("TIMESYNC", 1e-9 * m.tc1)  # an autopilot that started anew has forgotten its streams
             self.clock.answer(1e-9 * m.ts1, 1e-9 * m.tc1, now)
+
+
+def _calm(worst: float, calm: float, bad: float) -> float:
+    return min(max((bad - worst) / (bad - calm), 0.0), 1.0) if math.isfinite(worst) else 0.0
+
+
+def _implied(autopilot: str, firmware: tuple[int, int, int]) -> str:
+    """Return what follows from a firmware's version."""
+    if autopilot == "ardupilot" and firmware < (4, 1, 0):
+        return ": its local position is relative to home, which moves while it is disarmed"
+    if autopilot == "ardupilot" and firmware >= (4, 7, 0):
+        return ": SYSID_MYGCS is called MAV_GCS_SYSID"
+    return ""
 
 
 def local_of(origin: tuple[float, float], latitude: float, longitude: float, autopilot: str) -> tuple[float, float]:
