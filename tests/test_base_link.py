@@ -380,7 +380,7 @@ def test_the_first_read_of_the_loop_has_all_packets_since_the_start_and_the_stat
     assert lab.link.received[: len(handshake)] == handshake
     assert len(lab.link.received) > len(handshake) + 500
     assert f.position_age < 0.1
-    assert f.uplink_age == 0.0  # nothing was asked meanwhile: that is no deaf vehicle
+    assert f.uplink_age < 0.1  # nothing was asked meanwhile: that is no deaf vehicle
     assert not lab.link._backlog
 
 
