@@ -29,7 +29,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal, NamedTuple
 
-import rtctl  # noqa: F401  its import names the kernel cache after the sources, for what runs beside vcan0 too
+from rtctl.kernel.cache import folder as kernel_folder
 from tools.child import Sink, exit_status, guarded, pipe, pump, writer
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -256,7 +256,7 @@ def _pack(scratch: Path, env: Mapping[str, str]) -> list[Path]:
     hostfs cuts modification times to whole seconds, so numba's on-disk cache would take every file for a changed one
     and, worse, rewrite the host's cache so. A tar archive keeps the nanoseconds.
     """
-    wanted = [ROOT / "rtctl", ROOT / "firmware_sim", Path(env.get("NUMBA_CACHE_DIR") or ROOT / "rtctl").resolve()]
+    wanted = [ROOT / "rtctl", ROOT / "firmware_sim", kernel_folder().resolve()]
     paths = sorted({path for path in wanted if path.is_dir()})
     names = [str(path.relative_to("/")) for path in paths]
     archive = ["tar", "--format=pax", "--warning=none", "-C", "/", "-cf", str(scratch / "copies.tar"), *names]

@@ -362,7 +362,8 @@ class RigidBody:
         q, qd: (n,) [rad, rad/s]. The result shares no memory with this object.
         """
         pin.computeAllTerms(self.model, self.data, self.configuration(q), self._velocity(qd))
-        *terms, Rj, tj = _assemble(self._terms, self.skeleton, qd, points.link, points.local)
+        found = _assemble(self._terms, self.skeleton, qd, points.link, points.local)
+        terms, (Rj, tj) = found[:12], found[12:]
         rho, rows = np.zeros(0), np.zeros((0, self.n))
         if own:
             rho, rows = own.measure(Rj, tj, self._terms.J, self.skeleton.iv, self.skeleton.chain)

@@ -1,0 +1,112 @@
+"""Compiled kernels are kept by what they are made of: told from numba's own counts of what it loaded and compiled."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rtctl.kernel.cache import VERSIONS, stamp
+from tests.test_architecture import ROOT, imports, modules
+
+LOW = "from rtctl.kernel import kernel\n\n@kernel\ndef low(x):\n    return x * 2.0\n"
+HIGH = (
+    "from rtctl.kernel import kernel\nfrom lab.low import (\n    low,\n)\n\n"
+    "@kernel\ndef high(x):\n    return low(x) + 1.0\n"
+)
+ASIDE = "from rtctl.kernel import kernel\n\n@kernel\ndef aside(x):\n    return -x\n"
+LAYOUT = "import numpy as np\n\nSTATE = np.dtype([('x', 'f8'), ('y', 'f8')], align=True)\n"
+RECORD = (
+    "from rtctl.kernel import kernel\n\n@kernel\ndef inner(s):\n    return s['y']\n\n"
+    "@kernel\ndef y_of(s):\n    return inner(s)\n"
+)
+RUN = """
+import json
+import numpy as np
+from lab.low import low
+from lab.high import high
+from lab.aside import aside
+from lab.layout import STATE
+from lab.record import y_of
+state = np.zeros((), STATE)
+state['x'], state['y'] = 3.0, 5.0
+values = [high(1.0), low(1.0), aside(1.0), y_of(state[()])]
+compiled = [f.__name__ for f in (high, low, aside, y_of) if sum(f.stats.cache_misses.values())]
+print(json.dumps([values, compiled]))
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    sources = {"low": LOW, "high": HIGH, "aside": ASIDE, "layout": LAYOUT, "record": RECORD, "__init__": ""}
+    for name, text in sources.items():
+        (folder / f"{name}.py").write_text(text)
+    return folder
+
+
+def run(lab: Path, **settings: str) -> tuple[list[float], list[str]]:
+    """Return what the kernels give in a new process, and which of them were compiled there."""
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    env |= {"PYTHONPATH": f"{lab.parent}:{ROOT}", "XDG_CACHE_HOME": str(lab.parent / "cache"), **settings}
+    done = subprocess.run([sys.executable, "-c", RUN], env=env, capture_output=True, text=True, check=True)
+    values, compiled = json.loads(done.stdout)
+    return values, compiled
+
+
+def test_a_change_recompiles_what_depends_on_it_and_nothing_else(lab: Path) -> None:
+    assert run(lab) == ([3.0, 2.0, -1.0, 5.0], ["high", "low", "aside", "y_of"])
+    assert run(lab) == ([3.0, 2.0, -1.0, 5.0], [])
+    (lab / "low.py").write_text(LOW.replace("2.0", "7.0"))
+    assert run(lab) == ([8.0, 7.0, -1.0, 5.0], ["high", "low"])
+    (lab / "low.py").write_text(LOW)  # both versions are there
+    assert run(lab) == ([3.0, 2.0, -1.0, 5.0], [])
+
+
+def test_another_layout_of_a_record_is_another_kernel(lab: Path) -> None:
+    """The kernel's module does not import the layout; what numba is called with tells them apart."""
+    assert run(lab)[0][3] == 5.0
+    for text in (
+        LAYOUT.replace("('x'", "('z', 'f8'), ('x'"),
+        LAYOUT.replace("('x', 'f8'), ('y', 'f8')", "('y', 'f8'), ('x', 'f8')"),
+    ):
+        (lab / "layout.py").write_text(text)
+        assert run(lab) == ([3.0, 2.0, -1.0, 5.0], ["y_of"])
+        assert run(lab) == ([3.0, 2.0, -1.0, 5.0], [])
+    (lab / "layout.py").write_text(LAYOUT)
+    assert run(lab) == ([3.0, 2.0, -1.0, 5.0], [])
+
+
+def test_old_versions_are_let_go(lab: Path) -> None:
+    home = lab.parent / "cache" / "rtctl" / "lab.low"
+    for k in range(VERSIONS + 2):
+        (home / f"old{k}").mkdir(parents=True)
+        os.utime(home / f"old{k}", (k, k))
+    run(lab)
+    kept = {path.name for path in home.iterdir()}
+    assert len(kept) == VERSIONS
+    assert not kept & {"old0", "old1", "old2"}
+
+
+def test_a_folder_that_others_may_write_is_not_taken(lab: Path) -> None:
+    (lab.parent / "cache" / "rtctl").mkdir(parents=True)
+    (lab.parent / "cache" / "rtctl").chmod(0o777)
+    other = lab.parent / "tmp"
+    other.mkdir()
+    assert run(lab, TMPDIR=str(other))[0][0] == 3.0
+    assert not any((lab.parent / "cache" / "rtctl").iterdir())
+    assert (other / f"rtctl-kernels-{os.geteuid()}" / "lab.high").is_dir()
+
+
+def test_a_stamp_follows_every_import_of_the_program() -> None:
+    """The imports that a stamp follows are at least those that Python's own parser finds."""
+    from rtctl.kernel import cache
+
+    known = modules("rtctl")
+    tops = (("rtctl", ROOT),)
+    for name in known:
+        assert imports(known, name) <= set(cache._source(tops, name)[1]), name
+    assert len({stamp(name, str(path)) for name, path in known.items()}) > 0.9 * len(known)
