@@ -1,5 +1,7 @@
 """`make bench`: the figures of speed on this machine, each beside what it is to be compared with.
 
+    python -m tools.bench --part turn --part wake --json
+
 Rivals are timed in turns within one run, so that ratios hold where absolute times drift.
 """
 
@@ -9,29 +11,28 @@ import json
 import os
 import platform
 import re
-import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from rtctl.app.servo import CAN_RX, TICK, Servo, first_feedback
+from rtctl.app.servo import first_feedback
 from rtctl.arm import pipe
 from rtctl.arm.law import evaluate_law
 from rtctl.arm.osc import operational_space
 from rtctl.arm.pipe import initial, tick, warm
 from rtctl.arm.robot import Robot
 from rtctl.hal import clock
-from rtctl.hal.can.link import CanLink, LinkSpec
-from rtctl.log.record import ring
-from rtctl.types import I64, Command, Drive, Request
-from tools.bench_rig import Arm, BoundFloor, Bus, Case, Floor, Null, case, request, robot_and_spec
+from rtctl.hal.can.link import LinkSpec
+from rtctl.types import I64
+from tools import bench_log, bench_turn
+from tools.bench_rig import Arm, BoundFloor, Case, Floor, case, request, robot_and_spec
+from tools.bench_rows import Row, row, timed
 
 # The blocks of the tick, in order: function of rtctl.arm.pipe -> name of the row.
 STAGES = {
@@ -44,37 +45,8 @@ STAGES = {
     "_diagnosed": "diagnose",
     "_record": "record",
 }
-PRIORITY = 80
-FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000, "log": 10}
-QUICK = {"law": 20, "tick": 60, "call": 20, "wake": 20, "log": 1}
-
-
-class Row(NamedTuple):
-    """One figure [us]; `limit` and `ratio` where there is something to compare with."""
-
-    part: str
-    name: str
-    p50: float | None
-    p99: float | None
-    ratio: float | None = None  # to `rival`, of the medians unless the note says otherwise
-    rival: str = ""
-    note: str = ""
-
-
-def row(part: str, name: str, ns: "I64 | list[int]", **more: Any) -> Row:
-    """Return the row of measured times [ns]."""
-    values = np.asarray(ns, np.float64) * 1e-3
-    return Row(part, name, float(np.median(values)), float(np.percentile(values, 99)), **more)
-
-
-def timed(call: Callable[[], object], count: int) -> I64:
-    """Return the time [ns] of each of `count` calls."""
-    now, out = time.perf_counter_ns, np.empty(count, np.int64)
-    for i in range(count):
-        begin = now()
-        call()
-        out[i] = now() - begin
-    return out
+FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000, "log": 10, "demo": 60}
+QUICK = {"law": 20, "tick": 60, "call": 20, "wake": 20, "log": 1, "demo": 1}
 
 
 def machine() -> dict[str, Any]:
@@ -177,93 +149,6 @@ def _session(robot: Robot, count: int) -> tuple[I64, np.ndarray]:
     return ns, due
 
 
-@contextmanager
-def urgent() -> Iterator[str]:
-    """Run under SCHED_FIFO as the daemon does, if that is granted; give the policy's name."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    except OSError as error:
-        yield f"SCHED_OTHER ({error.strerror})"
-        return
-    try:
-        yield f"SCHED_FIFO {PRIORITY}"
-    finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
-def turns(robot: Robot, spec: LinkSpec, count: int) -> Iterator[Row]:
-    """The turn at its own rate: bus, tick, bus, record into the ring, digest; the drives answer before, untimed."""
-    with ExitStack() as stack:
-        bus = stack.enter_context(closing(Bus(spec)))
-        record = stack.enter_context(_ring())
-        arm = Arm(robot)
-        servo = Servo(robot, CanLink(spec, bus.transport), record, arm.q)
-        servo.link.write(Command(Drive.DISABLE, np.zeros(robot.n)))
-        ns, due = np.empty(count, np.int64), np.zeros(count, np.bool_)
-        policy = stack.enter_context(urgent())
-        for k, _ in zip(range(count), clock.grid(robot.dt)):  # noqa: B905 the grid has no end
-            bus.answer(arm.feedback())
-            asked, slot = request(servo.memory, k), clock.Slot(k, 0, 0.0)
-            begin = time.perf_counter_ns()
-            turn = servo.turn(slot, asked)
-            ns[k] = time.perf_counter_ns() - begin
-            due[k] = servo.memory.evaluated
-            arm.obey(servo.memory, turn.command.drive, turn.command.tau)
-            record.words[ring.TAIL] = record.words[ring.HEAD_AT]  # as a recorder that keeps up
-    share = float(np.percentile(ns, 99)) / (0.25e9 * robot.dt)
-    yield row(
-        "turn", "turn with bus and log", ns, ratio=share, rival=f"25 % of {1e3 * robot.dt:g} ms, p99", note=policy
-    )
-    if due.any() and not due.all():
-        yield row("turn", "turn, model due", ns[due])
-        yield row("turn", "turn, model kept", ns[~due])
-    link, null = CanLink(spec, Null()), Null()
-    link.transport = null
-    command = Command(Drive.TORQUE, np.linspace(-5.0, 5.0, robot.n))
-    yield row("turn", f"encode {robot.n} commands", timed(lambda: link.write(command), count))
-    maker = Bus(spec)
-    frames = [maker.replies(arm.feedback()) for _ in range(256)]
-    maker.close()
-    slots = iter(range(count))
-
-    def read() -> None:
-        null.waiting = frames[next(slots) % 256]
-        link.read(0, 0, 0.0, 0.0)
-
-    yield row("turn", f"decode {robot.n} replies", timed(read, count))
-
-
-@contextmanager
-def _ring() -> Iterator[ring.Producer]:
-    producer = ring.create(f"rtctl-bench-{os.getpid()}.ring", 1 << 22, b"{}")
-    try:
-        yield producer
-    finally:
-        producer.unmap()
-        producer.path.unlink()
-
-
-def puts(robot: Robot, count: int) -> Iterator[Row]:
-    """One entry into the ring."""
-    _, _, record = tick(robot, initial(robot, first_feedback(robot.home)), Arm(robot).feedback(), Request())
-    with _ring() as producer:
-        for name, kind, payload in (("record", TICK, record.tobytes()), ("CAN FD frame", CAN_RX, bytes(72))):
-
-            def put(kind: int = kind, payload: bytes = payload) -> None:
-                producer.put(kind, payload, 0)
-                producer.words[ring.TAIL] = producer.words[ring.HEAD_AT]
-
-            yield row("ring", f"put {name} ({len(payload)} B)", timed(put, count), note="target p50 below 5 us")
-
-
-def logs(seconds: int) -> Iterator[Row]:
-    """What logging costs and how fast logs load; the load times on ten minutes, or on a little if asked for little."""
-    from tools.bench_log import figures
-
-    for figure in figures(seconds, copies=600 // seconds if seconds > 1 else 1):
-        yield Row("log", figure.name, figure.p50, figure.p99, note=figure.note)
-
-
 def models(robot: Robot, count: int) -> Iterator[Row]:
     """Parameter evaluation."""
     q, qd = robot.home, np.zeros(robot.n)
@@ -286,59 +171,46 @@ def collections() -> Iterator[Row]:
     gc.enable()
 
 
-def wakes(period: float, floor: Floor | None, why: str, count: int) -> Iterator[Row]:
-    """Lateness of wake-ups under SCHED_FIFO: our grid, a bare C loop, cyclictest; by turns."""
-    ours, theirs = [], []
-    with urgent() as policy:
-        for _ in range(4):
-            slots = clock.grid(period)
-            ours += [round(next(slots).lateness * 1e9) for _ in range(count // 4)]
-            if floor is not None:
-                theirs += floor.wake(round(period * 1e9), count // 4).tolist()
-    if not theirs:
-        yield row("wake-up", "our grid", ours, note=f"{policy}; no C loop: {why}")
-    else:
-        ratio = float(np.percentile(ours, 99) / np.percentile(theirs, 99))
-        yield row("wake-up", "our grid", ours, ratio=ratio, rival="bare C loop, p99", note=policy)
-        yield row("wake-up", "bare C loop", theirs, note=policy)
-    yield _cyclictest(period, count)
+class Bench(NamedTuple):
+    """What the parts measure on."""
+
+    robot: Robot
+    spec: LinkSpec
+    floor: Floor | None
+    why: str  # there is no floor
+    counts: dict[str, int]
 
 
-def _cyclictest(period: float, count: int) -> Row:
-    name = shutil.which("cyclictest")
-    if name is None:
-        return Row("wake-up", "cyclictest", None, None, note="left out: not installed (rt-tests)")
-    command = [name, "-q", "-m", f"-p{PRIORITY}", f"-i{round(period * 1e6)}", f"-l{count}", "-h2000"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    late = [
-        int(us) for us, n in re.findall(r"^(\d+)\s+(\d+)", done.stdout, re.MULTILINE) for _ in range(int(n))
-    ]  # microseconds, a line for each
-    if not late:
-        return Row(
-            "wake-up", "cyclictest", None, None, note=f"left out: {(done.stderr.splitlines() or ['nothing said'])[0]}"
-        )
-    return row("wake-up", "cyclictest", [1000 * us for us in late])
+PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
+    "gc": lambda b: collections(),
+    "law": lambda b: laws(b.robot, b.floor, b.why, b.counts["law"]),
+    "tick": lambda b: ticks(b.robot, b.counts["tick"]),
+    "turn": lambda b: bench_turn.turns(b.robot, b.spec, b.counts["tick"]),
+    "ring": lambda b: bench_turn.puts(b.robot, b.counts["call"]),
+    "model": lambda b: models(b.robot, b.counts["call"]),
+    "log": lambda b: bench_log.recording(b.counts["log"]),
+    "load": lambda b: bench_log.loading(b.counts["log"]),
+    "replay": lambda b: bench_log.replaying(b.counts["demo"]),
+    "sim": lambda b: bench_log.simulating(b.counts["demo"]),
+    "wake": lambda b: bench_turn.wakes(b.robot.dt, b.floor, b.why, b.counts["wake"]),
+}
 
 
-def measure(counts: dict[str, int]) -> tuple[dict[str, Any], list[Row]]:
-    """Return the machine and every row."""
+def measure(counts: dict[str, int], parts: list[str]) -> tuple[dict[str, Any], list[Row]]:
+    """Return the machine and the rows of these parts."""
     floor, why = Floor.build()
     begin = time.perf_counter()
     robot, spec = robot_and_spec()
     warm(robot)
     about = {**machine(), "floor": why, "build_and_warm_s": round(time.perf_counter() - begin, 2)}
-    rows = list(collections())
+    bench = Bench(robot, spec, floor, why, counts)
+    rows = list(PARTS["gc"](bench)) if "gc" in parts else []
     gc.collect()
     gc.freeze()
     gc.disable()  # as in the daemon
     try:
-        rows += laws(robot, floor, why, counts["law"])
-        rows += ticks(robot, counts["tick"])
-        rows += turns(robot, spec, counts["tick"])
-        rows += puts(robot, counts["call"])
-        rows += models(robot, counts["call"])
-        rows += logs(counts["log"])
-        rows += wakes(robot.dt, floor, why, counts["wake"])
+        for name in parts:
+            rows += PARTS[name](bench) if name != "gc" else ()
     finally:
         gc.enable()
         gc.unfreeze()
@@ -362,9 +234,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit code is 0."""
     parser = argparse.ArgumentParser(prog="tools.bench", description="The figures of speed on this machine.")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--part", action="append", choices=PARTS, help="measure this alone; repeatable")
     parser.add_argument("--quick", action="store_true", help="a few calls of each: shows that it runs, not how fast")
     chosen = parser.parse_args(arguments)
-    about, rows = measure(QUICK if chosen.quick else FULL)
+    about, rows = measure(QUICK if chosen.quick else FULL, chosen.part or list(PARTS))
     if chosen.json:
         print(json.dumps({"machine": about, "rows": [r._asdict() for r in rows]}, indent=2))
     else:

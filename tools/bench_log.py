@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,93 +31,73 @@ from rtctl.log.schema import channels
 from rtctl.log.view.report import write_report
 from rtctl.types import Command, Drive
 from tools.bench_rig import CONFIG, Arm, Bus, request, robot_and_spec
+from tools.bench_rows import Row, row, urgent
 
 DEMO = CONFIG.parent / "demo.toml"
-DEMO_S = 60.0
+SIMULATED_S = 20.0  # of the demo, for the pace of a simulation
 TICK_HZ = os.sysconf("SC_CLK_TCK")
 TIMES_AT = 15  # of log_time in a message record; publish_time follows
 
 
-class Figure(NamedTuple):
-    """One figure: [us], and what it says."""
-
-    name: str
-    p50: float | None
-    p99: float | None
-    note: str = ""
+BLOCK = 50  # turns with and without log, by turns
 
 
-class Turns(NamedTuple):
-    """A stretch of the servo loop at its own rate."""
-
-    turn: "np.ndarray[Any, np.dtype[np.float64]]"  # [us]
-    late: "np.ndarray[Any, np.dtype[np.float64]]"  # [us] of wake-ups
-
-
-def figures(seconds: float, copies: int) -> Iterator[Figure]:
-    """Yield all figures; the log of `seconds` is repeated `copies` times for the load times."""
+def recording(seconds: float) -> Iterator[Row]:
+    """What the log adds to a turn, and what its recorder costs."""
     with tempfile.TemporaryDirectory(prefix="rtctl-bench-") as name:
-        folder = Path(name)
-        source = yield from _recording(folder, seconds)
-        yield from _loading(folder, source, copies)
-        yield from _replaying(folder, DEMO_S if copies > 1 else seconds)
+        yield from _recording(Path(name), seconds)[1]
 
 
-def _recording(folder: Path, seconds: float) -> "Any":
-    robot, _ = robot_and_spec()
-    count = max(50, round(seconds / robot.dt))
-    quiet, logged = [], []
+def loading(seconds: float) -> Iterator[Row]:
+    """How fast logs load: ten minutes, or a little if asked for little."""
+    with tempfile.TemporaryDirectory(prefix="rtctl-bench-") as name:
+        source, _ = _recording(Path(name), min(seconds, 2.0))
+        yield from _loading(Path(name), source, copies=300 if seconds > 1.0 else 1)
+
+
+def _recording(folder: Path, seconds: float) -> tuple[Path, list[Row]]:
+    """Record the bench's arm; return the log, and what it cost."""
+    robot, spec = robot_and_spec()
+    count = max(2 * BLOCK, round(seconds / robot.dt))
     header = header_of(cfg.load(CONFIG), CONFIG, robot, robot.home)
     recorder = Recorder.start(folder / "log", header, segment_s=3600.0)
     used = _cpu(recorder.pid)
-    quiet.append(_turns(None, count // 2))  # before and after: what drifts hits both
-    logged.append(_turns(recorder, count))
-    quiet.append(_turns(None, count - count // 2))
-    busy = count * robot.dt
-    time.sleep(0.3)
-    share = (_cpu(recorder.pid) - used) / busy
-    stats = recorder.close("bench")
-    size = stats.path.stat().st_size
-    for label, runs in (("turn without log", quiet), ("turn with log", logged)):
-        values = np.concatenate([each.turn for each in runs])
-        yield Figure(label, *_quantiles(values))
-    for label, runs in (("wake-up without log", quiet), ("wake-up with log", logged)):
-        yield Figure(label, *_quantiles(np.concatenate([each.late for each in runs])))
-    yield Figure(
-        "recorder, CPU per s of robot time",
-        1e6 * share,
-        1e6 * share,
-        f"{100 * share:.1f} % of a core, {stats.dropped} dropped",
-    )
-    yield Figure("log size", None, None, f"{size / busy * 60 / 1e6:.1f} MB per minute, {stats.entries} entries")
-    return stats.path
-
-
-def _turns(recorder: Recorder | None, count: int) -> Turns:
-    robot, spec = robot_and_spec()
-    turn, late = np.empty(count), np.empty(count)
-    with closing(Bus(spec)) as bus:
+    turn, late, logged = np.empty(count), np.empty(count), np.arange(count) // BLOCK % 2 == 1
+    with closing(Bus(spec)) as bus, urgent() as policy:
         arm = Arm(robot)
-        servo = Servo(robot, CanLink(spec, bus.transport), recorder, arm.q)
+        servo = Servo(robot, CanLink(spec, bus.transport), None, arm.q)
         servo.link.write(Command(Drive.DISABLE, np.zeros(robot.n)))
         for k, slot in zip(range(count), clock.grid(robot.dt)):  # noqa: B905 the grid has no end
             bus.answer(arm.feedback())
+            servo.sink = recorder if logged[k] else None
             begin = time.perf_counter_ns()
             done = servo.turn(clock.Slot(k, 0, slot.lateness), request(servo.memory, k))
-            turn[k] = (time.perf_counter_ns() - begin) * 1e-3
-            late[k] = slot.lateness * 1e6
+            turn[k] = time.perf_counter_ns() - begin
+            late[k] = slot.lateness * 1e9
             arm.obey(servo.memory, done.command.drive, done.command.tau)
-    return Turns(turn, late)
+    time.sleep(0.3)
+    busy = int(logged.sum()) * robot.dt
+    share = 1e6 * (_cpu(recorder.pid) - used) / busy
+    stats = recorder.close("bench")
+    size, lost = stats.path.stat().st_size, f"{stats.dropped} dropped"
+    adds = 1e-3 * float(np.median(turn[logged]) - np.median(turn[~logged]))
+    tail = 1e-3 * float(np.percentile(turn[logged], 99) - np.percentile(turn[~logged], 99))
+    rows = [
+        row("log", "turn without log", turn[~logged], note=policy),
+        row("log", "turn with log", turn[logged]),
+        Row("log", "log adds to a turn", adds, tail, note="target p50 below 10 us; difference of both, by turns"),
+        row("log", "wake-up without log", late[~logged]),
+        row("log", "wake-up with log", late[logged]),
+        Row("log", "recorder, CPU per s of log", share, share, note=f"{1e-4 * share:.1f} % of a core, {lost}"),
+        Row("log", "log size", None, None, note=f"{size / busy * 60 / 1e6:.1f} MB per minute, {stats.entries} entries"),
+    ]  # fmt: skip
+    return stats.path, rows
 
 
 def _cpu(pid: int) -> float:
     """Return the processor time [s] that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK_HZ
-
-
-def _quantiles(values: Any) -> tuple[float, float]:
-    return float(np.median(values)), float(np.percentile(values, 99))
 
 
 def stretched(source: Path, target: Path, copies: int) -> float:
@@ -142,7 +121,7 @@ def stretched(source: Path, target: Path, copies: int) -> float:
     return copies * span / 1e9
 
 
-def _loading(folder: Path, source: Path, copies: int) -> Iterator[Figure]:
+def _loading(folder: Path, source: Path, copies: int) -> Iterator[Row]:
     long = folder / "long.mcap"
     seconds = stretched(source, long, copies)
     minutes = f"of {seconds / 60:.1f} min at 1 kHz, {long.stat().st_size / 1e6:.0f} MB"
@@ -176,24 +155,39 @@ def _loading(folder: Path, source: Path, copies: int) -> Iterator[Figure]:
             begin_ns = time.perf_counter_ns()
             call()
             took.append((time.perf_counter_ns() - begin_ns) * 1e-3)
-        yield Figure(name, float(np.median(took)), float(np.max(took)), note)
-    yield Figure("report size", None, None, f"{(folder / 'long.html').stat().st_size / 1e6:.2f} MB of HTML")
+        yield Row("load", name, float(np.median(took)), float(np.max(took)), note=note)
+    yield Row("load", "report size", None, None, note=f"{(folder / 'long.html').stat().st_size / 1e6:.2f} MB of HTML")
 
 
-def _replaying(folder: Path, seconds: float) -> Iterator[Figure]:
-    """Replay the demo as people do: by the command, in a process of its own that no realtime class binds to a core."""
-    scene, log = folder / "demo.toml", folder / "demo.mcap"
+def _demo(folder: Path, seconds: float) -> Path:
+    """Write the demo's scenario, cut to `seconds`."""
+    scene = folder / "demo.toml"
     text = DEMO.read_text().replace('robot = "panda"', f'robot = "{CONFIG}"')
     scene.write_text(re.sub(r"(?m)^duration_s = .*$", f"duration_s = {seconds}", text))
-    simulate(scene, log=log)
-    begin_ns = time.perf_counter_ns()
-    rebuilt(read_run(log))
-    took = (time.perf_counter_ns() - begin_ns) * 1e-3
-    yield Figure("replay, build the robot", took, took, "once a log")
-    command = [sys.executable, "-m", "rtctl", "log", "replay", str(log), "--json"]
-    found = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    return scene
+
+
+def replaying(seconds: float) -> Iterator[Row]:
+    """Replay the demo as people do: by the command, in a process of its own that no realtime class binds to a core."""
+    with tempfile.TemporaryDirectory(prefix="rtctl-bench-") as name:
+        log = Path(name) / "demo.mcap"
+        simulate(_demo(Path(name), seconds), log=log)
+        begin_ns = time.perf_counter_ns()
+        rebuilt(read_run(log))
+        took = (time.perf_counter_ns() - begin_ns) * 1e-3
+        yield Row("replay", "build the robot", took, took, note="once a log")
+        command = [sys.executable, "-m", "rtctl", "log", "replay", str(log), "--json"]
+        found = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     says = "identical" if found["identical"] else "NOT identical"
     each = 1e3 / found["realtime_factor"]  # a tick is a millisecond
     cores = len(os.sched_getaffinity(0))
-    note = f"{found['realtime_factor']:.1f} x real time on {cores} cores (target 10), {seconds:g} s of demo, {says}"
-    yield Figure("replay, a tick", each, each, note)
+    note = f"{found['realtime_factor']:.1f} x real time on {cores} cores (target 40), {seconds:g} s of demo, {says}"
+    yield Row("replay", "a tick", each, each, note=note)
+
+
+def simulating(seconds: float) -> Iterator[Row]:
+    """Simulate the demo: controller, drives, plant and the oracle's distances in one process."""
+    with tempfile.TemporaryDirectory(prefix="rtctl-bench-") as name:
+        factor = float(simulate(_demo(Path(name), min(seconds, SIMULATED_S)))["realtime_factor"])
+    each = 1e3 / factor
+    yield Row("sim", "a tick", each, each, note=f"{factor:.1f} x real time (target 6)")

@@ -5,6 +5,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -115,6 +116,7 @@ class Bus:
 
     def __init__(self, spec: LinkSpec) -> None:
         self.spec, self._counter = spec, 0
+        self.size = frame.CANFD_MTU if spec.fd else frame.CAN_MTU
         self._folder = tempfile.TemporaryDirectory()
         server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         server.bind(f"{self._folder.name}/bus")
@@ -155,7 +157,7 @@ class Null:
     """A transport that has what it is told to have: the cost of packing and unpacking alone."""
 
     def __init__(self) -> None:
-        self.waiting: list[bytes] = []
+        self.waiting: Sequence[bytes] = []
 
     def __getattr__(self, name: str) -> Any:
         return {"receive": lambda: self.waiting, "send_all": lambda frames: frames, "flags": lambda: 0}[name]

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Debian packages for tests on real SocketCAN and of the report in a browser. Installs what is missing where it may (root, apt-get);
-# otherwise names the command, and everything but those tests works without.
+# Debian packages for tests on real SocketCAN and of the report in a browser, and for the benchmark. Installs what is
+# missing where it may (root, apt-get); otherwise names the command, and everything else works without.
 set -u
 
 have() {
@@ -16,6 +16,7 @@ have chromium || missing="$missing chromium"
 have chromedriver || missing="$missing chromium-driver"
 have ip || missing="$missing iproute2"
 have cansend || missing="$missing can-utils"
+have cyclictest || missing="$missing rt-tests" # the benchmark's rival in waking up
 if ! af_can; then # the kernel has no SocketCAN: a user-mode-linux guest has
     have linux.uml || missing="$missing user-mode-linux"
     have insmod || missing="$missing kmod"
@@ -31,5 +32,5 @@ if [ "$(id -u)" = 0 ] && have apt-get; then
         exit 0
     fi
 fi
-echo "tests on SocketCAN and in a browser need Debian packages that are not here. As root run: apt-get update && $command" >&2
+echo "tests on SocketCAN and in a browser, and the benchmark, need Debian packages that are not here. As root run: apt-get update && $command" >&2
 exit 1
