@@ -20,7 +20,6 @@ from rtctl.types import F64, Goal, Shape, State, Task
 from tests.arms import NO_POINTS, panda
 from tests.rig import ROOT, config_at
 from tools import demo, player
-from tools.demo import Voice
 from tools.outcome import Given, GoalOutcome, Outcome, judge
 from tools.pair import Child, DemoError, working_copy
 from tools.plot import silhouette
@@ -92,13 +91,18 @@ def test_a_demo_that_reaches_its_goals_says_so_and_exits_with_success(good: Run)
         r" +\d\.\d\d s  goal 1: arrived",
         r" +1\.\d\d s  goal 2 of 2: \(0\.45, -0\.2, 0\.45\) m",
         r" +\d\.\d\d s  goal 2: arrived",
-        r" +\d\.\d\d s  RUN +goal  \d  error +\d+\.\d mm  speed \d\.\d\d m/s  missed    0  nearest +\d+ mm ball",
+        r" +\d\.\d\d s  RUN +goal  \d  error +\d+\.\d mm  speed \d\.\d\d m/s  nearest +\d+ mm ball",
         r"contacts +0",
         r"faults +none",
         r"exit codes +controller 0, drives 0",
         r"PASS  2 of 2 goals reached, 0 contacts",
+        r"mode +lockstep",
     ):
         assert re.search(rf"(?m)^{line}\s*$", good.text), line
+    lines = good.text.strip().split("\n")
+    assert lines[0].startswith("LOCKSTEP")
+    assert lines[-1].startswith("LOCKSTEP")
+    assert not re.search("missed|deadline misses|wake-up late|drives late", good.text)
     assert "\x1b" not in good.text  # colours are for terminals
 
 
@@ -263,7 +267,7 @@ def outcome(reached: bool, missed: int = 0, slipped: float = 0.0) -> Outcome:
     ("options", "attempts", "played", "code"),
     [
         ([], [outcome(True)], ["real time"], 0),
-        ([], [None, outcome(True)], ["real time", "lockstep"], 0),  # the trial showed that it is too slow
+        ([], ["too slow", outcome(True)], ["real time", "lockstep"], 0),  # the trial showed that it is too slow
         ([], [outcome(False, missed=3), outcome(True)], ["real time", "lockstep"], 0),
         ([], [outcome(False, slipped=0.01), outcome(False)], ["real time", "lockstep"], 1),
         ([], [outcome(False)], ["real time"], 1),  # not the machine's fault
@@ -273,21 +277,39 @@ def outcome(reached: bool, missed: int = 0, slipped: float = 0.0) -> Outcome:
     ],
 )
 def test_lockstep_takes_over_only_where_the_machine_was_late(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: list[str], attempts: list[Outcome | None],
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: list[str], attempts: list[Outcome | str],
     played: list[str], code: int,
 ) -> None:  # fmt: skip
     modes: list[str] = []
     left = iter(attempts)
 
     def attempt(
-        config: Path, file: Path, scenario: object, out: Path, lockstep: bool, trial: bool, voice: Voice
-    ) -> Outcome | None:
+        config: Path, file: Path, scenario: object, out: Path, lockstep: bool, trial: bool, told: demo.Told
+    ) -> Outcome | str:
         modes.append("lockstep" if lockstep else "real time")
         return next(left)
 
     monkeypatch.setattr(demo, "_attempt", attempt)
+    monkeypatch.setattr(demo, "probed", lambda period: "")
     assert demo.main(["--scenario", str(ROOT / "configs/demo.toml"), "--out", str(tmp_path), *options]) == code
     assert modes == played
+
+
+def test_a_machine_that_wakes_up_late_plays_in_lockstep_at_once_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def attempt(*given: Any) -> Outcome:
+        given[6].begin(given[4])
+        return outcome(True)
+
+    monkeypatch.setattr(demo, "_attempt", attempt)
+    monkeypatch.setattr(demo.os, "sched_getaffinity", lambda process: {0, 1})
+    late = [demo.clock.Slot(k, 0, 9e-4) for k in range(1000)]
+    monkeypatch.setattr(demo.clock, "grid", lambda period: iter(late))
+    assert demo.main(["--scenario", str(ROOT / "configs/demo.toml"), "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.strip().split("\n")
+    assert lines[0] == lines[-1] == demo.LOCKSTEP
+    assert "wakes up 0.90 ms late" in lines[1]
 
 
 class Clockwork:

@@ -222,9 +222,9 @@ def _figures(outcome: Outcome, mode: str) -> list[tuple[str, Text]]:
         ("contacts", Text(str(len(outcome.contacts)), style="bold red" if outcome.contacts else "green")),
         ("mode", Text(mode)),
         ("ticks", Text(f"{outcome.ticks}, of them {outcome.slots - outcome.missed} with the arm driven")),
-        ("deadline misses", Text(f"{outcome.missed} of {outcome.slots} slots ({share:.2%})")),
     ]
     if mode == "real time":
+        rows.append(("deadline misses", Text(f"{outcome.missed} of {outcome.slots} slots ({share:.2%})")))
         rows.append(("wake-up late", Text(f"{outcome.late * 1e3:.2f} ms (99 % of slots)")))
         drives = f"{outcome.drives_late * 1e3:.1f} ms at most, {outcome.drives_slipped * 1e3:.0f} ms given up"
         rows.append(("drives late", Text(drives)))

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from rtctl import design as cfg
 from rtctl.errors import RtctlError
@@ -19,6 +19,22 @@ from rtctl.errors import RtctlError
 START_S = 600.0  # [s] for a process to be ready: the first ever compiles every kernel
 END_S = 60.0  # [s] for a process to end
 POLL = 0.05  # [s] between two looks at the controller
+
+
+class Cores(NamedTuple):
+    """Where the processes of a run in real time have their place."""
+
+    controller: int
+    others: frozenset[int]  # drives, player
+
+
+def placed() -> Cores | None:
+    """Return a core for the controller alone and those for the rest, None where there is one core for all.
+
+    The last one: interrupts and whatever else runs prefer the first.
+    """
+    *others, last = sorted(os.sched_getaffinity(0))
+    return Cores(last, frozenset(others)) if others else None
 
 
 class DemoError(RtctlError):
@@ -94,7 +110,9 @@ class Pair:
     def __init__(self, config: Path, scenario: Path, folder: Path, lockstep: bool) -> None:
         self.config, self.scenario, self.folder = config, scenario, folder
         self.mode = ["--lockstep"] if lockstep else []
-        self.console = cfg.load(config).console.socket or ""
+        loaded = cfg.load(config)
+        self.console, self.rate = loaded.console.socket or "", loaded.loop.servo_hz
+        self.cores = None if lockstep else placed()
         self.report_file = folder / "report.json"
         self.report_file.unlink(missing_ok=True)
         self.drives: Child | None = None
@@ -109,6 +127,8 @@ class Pair:
         try:
             command = [*python, "firmware_sim", str(self.config), *self.mode, *options]
             self.drives = self.start("drives", command)
+            if self.cores is not None:  # their clock must not wait for the controller, nor it for them
+                os.sched_setaffinity(self.drives.popen.pid, self.cores.others)
             self.said += self.drives.expect("drives ready")
             command = [*python, "rtctl", "run", str(self.config), *self.mode]
             self.controller = self.start("controller", command)
@@ -153,8 +173,8 @@ class Pair:
             return {}
 
 
-def working_copy(source: Path, target: Path, changes: Mapping[str, Mapping[str, str | None]]) -> None:
-    """Write a config with the strings in `changes` [table][key] replaced, comments and all else kept.
+def working_copy(source: Path, target: Path, changes: Mapping[str, Mapping[str, str | int | None]]) -> None:
+    """Write a config with the strings and numbers in `changes` [table][key] replaced, comments and all else kept.
 
     Raises DemoError when the file is written in a way that this cannot change.
     """

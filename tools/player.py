@@ -31,22 +31,33 @@ class Played(NamedTuple):
     log: str
 
 
-def play(console: str, scenario: Scenario, say: Say, events: Callable[[], Sequence[str]] = tuple) -> Played:
+def play(
+    console: str, scenario: Scenario, say: Say, events: Callable[[], Sequence[str]] = tuple, deadlines: bool = True
+) -> Played:
     """Arm the controller behind the control socket `console`, put the scenario's goals to it at their times, disarm.
 
     A scenario's time is the controller's since it was told to arm; that is when the drives' obstacles begin to move.
-    `say` takes (style, text) lines; `events` returns the lines that the controller has printed since the last call.
+    `say` takes (style, text) lines; `events` returns the lines that the controller has printed since the last call;
+    `deadlines`: how many slots were missed is told.
     Raises RtctlError when the controller does not arm, stops answering or its time stands still.
     """
     with Session(console, STUCK_S) as session:
-        return _Player(session, scenario, say, events).play()
+        return _Player(session, scenario, say, events, deadlines).play()
 
 
 class _Player:
     """Owns nothing; remembers where in the scenario it is."""
 
-    def __init__(self, session: Session, scenario: Scenario, say: Say, events: Callable[[], Sequence[str]]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        scenario: Scenario,
+        say: Say,
+        events: Callable[[], Sequence[str]],
+        deadlines: bool = True,
+    ) -> None:
         self.session, self.scenario, self.say, self.events = session, scenario, say, events
+        self.deadlines = deadlines
         self.pending = list(enumerate(scenario.goal, start=1))
         self.given: list[Given] = []
         self.period = 0.0  # [s]
@@ -188,10 +199,11 @@ class _Player:
         away = "        -" if error is None else f"{error * 1e3:6.1f} mm"
         near = min(status["clearance_m"].items(), key=lambda item: item[1], default=None)
         nearest = "-" if near is None else f"{near[1] * 1e3:4.0f} mm {near[0]}"
+        missed = f"  missed {status['missed'] - self.skipped:4}" if self.deadlines else ""
         self.say(
             "",
             f"{now:7.2f} s  {status['state']:8}  goal {number:>2}  error {away}  "
-            f"speed {status['speed_m_s']:.2f} m/s  missed {status['missed'] - self.skipped:4}  nearest {nearest}",
+            f"speed {status['speed_m_s']:.2f} m/s{missed}  nearest {nearest}",
         )
 
 

@@ -69,7 +69,7 @@ def _title(figure: Figure, trace: Trace, outcome: Outcome, mode: str) -> None:
     words = [
         f"{reached} of {len(outcome.goals) + len(outcome.never)} goals reached",
         f"{len(outcome.contacts)} contacts",
-        f"{outcome.missed} of {outcome.slots} deadlines missed",
+        *([] if mode == "lockstep" else [f"{outcome.missed} of {outcome.slots} deadlines missed"]),
         f"{1.0 / trace.period:.0f} Hz in {mode}",
         f"faults: {', '.join(outcome.faults) or 'none'}",
     ]
