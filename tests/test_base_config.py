@@ -9,9 +9,9 @@ import pytest
 from msgspec import inspect
 
 from rtctl import cli, design
-from rtctl.design.rover import build
+from rtctl.design.rover import build, report
 from rtctl.errors import EXIT_CONFIG, EXIT_OK, ConfigError
-from rtctl.spec.base import BaseConfig, load
+from rtctl.spec.base import BaseConfig, load, streams
 from rtctl.spec.read import convert
 from rtctl.spec.rules import refuse
 from tests.base_lab import CONFIGS, ROVER, ROVER_PX4
@@ -141,6 +141,34 @@ def test_the_shipped_files_pass_and_check_tells_what_follows_from_them(capsys, t
     for command in ("check", "run"):
         assert cli.main([command, str(bad)]) == EXIT_CONFIG
         assert capsys.readouterr().err.startswith(f"rtctl: {bad}: motion.v_max_m_s: got 200.0, wanted")
+
+
+@pytest.mark.parametrize(
+    ("baud", "signed", "fine"),
+    [(9600, False, False), (19200, False, False), (57600, False, True), (57600, True, True), (115200, True, True)],
+)
+def test_a_serial_line_bears_what_is_asked_of_it_or_is_refused(baud, signed, fine, tmp_path):
+    key = tmp_path / "key"
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    edits = [("link.url", f"serial:/dev/ttyAMA0:{baud}")]
+    edits += [("link.signing", "required"), ("link.key_file", str(key)), ("link.state_file", "s")] if signed else []
+    path = tmp_path / "base.toml"
+    written(edited(*edits), path)
+    if not fine:
+        with pytest.raises(ConfigError, match=r"link.url: .* a faster line"):
+            load(path)
+        return
+    config = load(path)
+    line = streams(config)
+    assert line is not None
+    around, most = 12 + 13 * signed, 0.8 * baud / 10
+    scan, quick = 10 * (around + 167), 2 * min(line.quick, 40.0) * (around + 28)
+    assert scan + quick + 10 * (around + 26) < most  # what the vehicle says in a second, from the messages' definitions
+    assert 50.0 / line.every * (around + 53) < most
+    names = [row.name for row in report(config, build(config, path)).rows]
+    assert names.count("line") == 2
+    assert line.quick >= 10.0
 
 
 def test_a_footprint_of_corners_becomes_points_that_cover_its_outline(tmp_path):

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 
 from rtctl.app.rover_sim import simulate_base
+from rtctl.errors import RtctlError
 from rtctl.spec.scenario import FaultTable, Scenario, TimedGoal, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -117,7 +118,10 @@ def replaced(scenario: Scenario, **changes: Any) -> Scenario:
 def played(case: Case) -> Run:
     """Return what came of a run, judged by the truth."""
     scenario = case.scenario
-    found = simulate_base(scenario, ROVER, case.world, None, False, track=True)
+    try:
+        found = simulate_base(scenario, ROVER, case.world, None, False, track=True)
+    except RtctlError as error:  # it did not even start
+        return Run(case.kind, case.world, scenario.seed, False, False, None, None, 0.0, 0, math.inf, str(error))
     track, goal = np.array(found["track"]), np.array((scenario.goal[-1].position_m or (0.0, 0.0, 0.0))[:2])
     away = np.hypot(*(track[:, 1:3] - goal).T)
     given = float(found["goals"][-1]["at_s"]) if found["goals"] else math.inf

@@ -26,7 +26,7 @@ from rtctl.rover.pipe import initial, tick
 from rtctl.rover.record import base_dtype, make_base_record
 from rtctl.rover.robot import Base
 from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback
-from rtctl.spec.base import BaseConfig
+from rtctl.spec.base import BaseConfig, streams
 from rtctl.types import State, Status, Task
 
 LINK = "vehicle"  # the link's name in the log
@@ -45,7 +45,7 @@ def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLi
     A real vehicle is waited for unless `handshake_s` bounds it; a simulated one for SIMULATED_WAIT.
     """
     c = config.link
-    key = key_of(config, path)
+    key, line = key_of(config, path), streams(config)
     state = None if c.state_file is None else Path(c.state_file)
     if state is not None and not state.is_absolute():
         state = path.parent / state
@@ -59,6 +59,8 @@ def open_link(config: BaseConfig, path: Path, wire: Wire | None = None) -> MavLi
         timeout=c.handshake_s or (math.inf if wire is None else SIMULATED_WAIT),
         scan=config.avoid.scan == "required",
         sensors=sensors_of(config),
+        quick=math.inf if line is None else line.quick,
+        every=1 if line is None else line.every,
     )
     if wire is None:
         return MavLink(spec, open_wire(c.url), Keys(key, state, c.signing_link_id))

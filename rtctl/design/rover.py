@@ -10,9 +10,10 @@ from rtctl.control.firas import field_params
 from rtctl.design.assets import load_assets, placed
 from rtctl.design.report import Report, Row
 from rtctl.errors import ConfigError
+from rtctl.protocol.mavlink_budget import MOST
 from rtctl.rover.occupancy import CELL
 from rtctl.rover.robot import Base, Limits, Margins, Noise, SafetyParams, Wheels
-from rtctl.spec.base import BaseConfig, braking_distance, hull, read_key
+from rtctl.spec.base import BaseConfig, braking_distance, hull, read_key, streams
 from rtctl.spec.obstacles import shape_of
 from rtctl.spec.read import name_place
 from rtctl.types import F64
@@ -120,6 +121,10 @@ def report(c: BaseConfig, base: Base) -> Report:
              "off: only what is told is avoided", base.safety.scan),
         _row("reach", base.reach, "m", "no goal further from the origin is taken"),
     ]  # fmt: skip
+    if (line := streams(c)) is not None:
+        note = f"received, position and attitude at {line.quick:g} Hz; {MOST:.0%} at most"
+        rows.append(_row("line", line.received, "", note))
+        rows.append(_row("line", line.sent, "", f"sent, set-points at {c.loop.servo_hz / line.every:g} Hz"))
     return Report(base.name, tuple(rows))
 
 

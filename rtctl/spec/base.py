@@ -12,6 +12,7 @@ from msgspec import Meta
 
 from rtctl.control.firas import eta_of, rho_num_of
 from rtctl.errors import ConfigError
+from rtctl.protocol.mavlink_budget import MOST, SCANS, Streams, baud_of, fitted
 from rtctl.protocol.signing import KEY
 from rtctl.rover.occupancy import CELL, STENCIL
 from rtctl.spec.obstacles import Name, Obstacle, refuse_obstacles
@@ -27,6 +28,13 @@ SCHEMES = {
     "udpout": "HOST:PORT of the vehicle",
     "tcp": "HOST:PORT of the vehicle",
     "serial": "a device, /dev/ttyACM0:BAUD",
+}
+
+
+QUICK_STREAMS = {"ardupilot": ("LOCAL_POSITION_NED", "ATTITUDE"), "px4": ("ODOMETRY", "ATTITUDE")}
+SLOW_STREAMS = {  # [Hz]
+    "ardupilot": {"EKF_STATUS_REPORT": 10.0, "GPS_RAW_INT": 5.0, "GLOBAL_POSITION_INT": 2.0, "HOME_POSITION": 1.0},
+    "px4": {"ESTIMATOR_STATUS": 10.0, "GPS_RAW_INT": 5.0},
 }
 
 
@@ -219,6 +227,18 @@ def _shape(c: BaseConfig) -> Iterator[Found]:
         yield Found("base.wheels", b.wheels, "skid or ackermann: ArduPilot's GUIDED takes no sideways speed")
 
 
+def streams(c: BaseConfig) -> Streams | None:
+    """Return what a serial line bears of the conversation, None where there is none."""
+    baud = baud_of(c.link.url)
+    if baud is None:
+        return None
+    quick, slow = QUICK_STREAMS[c.link.autopilot], dict(SLOW_STREAMS[c.link.autopilot])
+    if c.avoid.scan == "required":
+        kinds = [sensor.message for sensor in c.sensor] or ["OBSTACLE_DISTANCE"]
+        slow |= {kind: SCANS * kinds.count(kind) for kind in kinds}
+    return fitted(baud, c.loop.servo_hz, slow, quick, c.link.signing == "required")
+
+
 def _around_origin(corners: tuple[tuple[float, float], ...]) -> bool:
     """Return whether a polygon goes once around the origin, seen from where its angle rises all along."""
     angles = [math.atan2(y, x) for x, y in corners]
@@ -238,8 +258,11 @@ def _link(c: BaseConfig) -> Iterator[Found]:
         yield Found("link.url", link.url, wanted)
     elif scheme != "serial" and not _host_port(rest):
         yield Found("link.url", link.url, f"{scheme}:{SCHEMES[scheme]}, port 1 to 65535")
-    elif scheme == "serial" and not rest.rpartition(":")[2].isdigit():
+    elif scheme == "serial" and baud_of(link.url) is None:
         yield Found("link.url", link.url, f"serial:{SCHEMES[scheme]}")
+    elif (line := streams(c)) is not None and not line.fits:
+        why = f"a faster line: {line.received:.0%} of this one is received and {line.sent:.0%} sent, {MOST:.0%} at most"
+        yield Found("link.url", link.url, why)
     if link.signing == "required" and link.key_file is None:
         yield Found("link.key_file", "nothing", 'the file of the key, or signing = "off"')
     if link.signing == "off" and link.key_file is not None:

@@ -23,6 +23,7 @@ from rtctl.hal.mavlink.talk import Order, Talk, request, stream
 from rtctl.hal.mavlink.view import View, enu, local_of
 from rtctl.hal.mavlink.wire import Address, Wire
 from rtctl.protocol import signing
+from rtctl.protocol.mavlink_budget import QUICK
 from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word
 
 HEARTBEAT = 1.0  # [s] between ours
@@ -87,6 +88,8 @@ class MavSpec(NamedTuple):
     timeout: float  # [s] that the handshake waits for what is not there yet; infinite: for ever
     scan: bool  # a scan is required
     sensors: tuple[SensorSpec, ...]
+    quick: float = math.inf  # [Hz] of position and attitude, where the line bears no more
+    every: int = 1  # period in which a set-point goes out
 
 
 class MavLink:
@@ -109,6 +112,7 @@ class MavLink:
         self._heartbeat_due = self._sync_due = -math.inf
         self._ask, self._asked_at = Ask.SILENCE, 0.0
         self._setpoints_since = -1.0
+        self._turn = 0  # periods since set-points are streamed
         self._word = Word.PENDING
         self._reboots = 0
         self._subscribed = math.inf  # [s] when streams were asked for
@@ -298,7 +302,10 @@ class MavLink:
             self._setpoints_since = -1.0
             return []
         if self._setpoints_since < 0.0:
-            self._setpoints_since = now
+            self._setpoints_since, self._turn = now, 0
+        self._turn += 1
+        if (self._turn - 1) % self.spec.every:
+            return []
         return [self._setpoint(command if self._ask == Ask.DRIVE else command._replace(v=0.0, w=0.0, velocity=_ZERO))]
 
     def _turned(self, ask: Ask, now: float) -> None:
@@ -425,7 +432,7 @@ class MavLink:
         for name, (message, rate) in STREAMS.items():
             if name not in left_out:
                 self.talk.drop((name,))
-                self.talk.give(stream(name, message, rate))
+                self.talk.give(stream(name, message, min(rate, self.spec.quick if name in QUICK else rate)))
         self.talk.drop(("AUTOPILOT_VERSION",))
         self.talk.give(request("AUTOPILOT_VERSION", 148))
         self._ask_for_origin(self._subscribed)
