@@ -207,8 +207,9 @@ def surroundings(config: Any, link: Any, dry: bool) -> dict[str, str]:
 
 
 def _greeted(config: Config, link: CanLink, lockstep: bool, signals: Signals) -> Feedback:
-    listen = 0.0 if lockstep else 1e-3 * config.link.listen_ms
-    return first_feedback(handshake(link, listen=listen, recover=True).q)
+    if lockstep:  # a busy machine may take its time: none passes for the drives
+        return first_feedback(handshake(link, listen=0.0, recover=True, timeout=LOCKSTEP_WAIT).q)
+    return first_feedback(handshake(link, listen=1e-3 * config.link.listen_ms, recover=True).q)
 
 
 def _recorder(config: Any, header: Header) -> Recorder:
@@ -270,7 +271,7 @@ def _fallback(servo: Servo, recorder: Recorder, slots: Iterator[Slot], lockstep:
     -D qd + g through the permitter, from the feedback alone: nothing of the tick that failed is used.
     """
     robot, m = servo.robot, servo.memory
-    g, sent, rest, driven = m.model.g, m.sent[0], 0, True
+    g, sent, rest, driven, heard = m.model.g, m.sent[0], 0, True, True
     for k, turn in enumerate(slots):
         feedback = servo.link.read(turn.slot, turn.missed, turn.lateness, 0.0)
         recorder.put_many(CAN_RX, servo.link.received, time.monotonic_ns())
@@ -285,7 +286,7 @@ def _fallback(servo: Servo, recorder: Recorder, slots: Iterator[Slot], lockstep:
         ).tau
         _send(servo.link, recorder, Command(Drive.TORQUE, sent))
         if lockstep:
-            servo.link.wait_replies(LOCKSTEP_SILENT)
+            heard = servo.link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
 
 
 def _stop_frames(link: CanLink, robot: Robot, recorder: Recorder) -> None:
