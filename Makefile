@@ -11,6 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
+WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
@@ -37,7 +38,7 @@ bench: install
 stress: install
 	$(BIN)/python -m tools.stress
 
-install: $(INSTALLED) $(SYSTEM)
+install: $(INSTALLED) $(SYSTEM) $(WARM)
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rtctl needs Python 3.11 or newer: make PYTHON=..." >&2; exit 1; }
@@ -49,6 +50,11 @@ $(INSTALLED): requirements.lock pyproject.toml
 # Done once where it succeeds; where it may not install, it names the command and is asked again next time.
 $(SYSTEM): tools/setup.sh | $(INSTALLED)
 	@if sh tools/setup.sh; then touch $@; fi
+
+# Compiled ahead, so that the first start is a quick one; a start does it by itself where this did not.
+$(WARM): $(shell find rtctl -name '*.py') | $(INSTALLED)
+	-$(BIN)/rtctl warm
+	@touch $@
 
 lock: $(INSTALLED)
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \

@@ -110,3 +110,14 @@ def test_a_stamp_follows_every_import_of_the_program() -> None:
     for name in known:
         assert imports(known, name) <= set(cache._source(tops, name)[1]), name
     assert len({stamp(name, str(path)) for name, path in known.items()}) > 0.9 * len(known)
+
+
+def test_two_processes_share_the_work(lab: Path) -> None:
+    """Each kernel is compiled by one of two that start at once; the other loads it."""
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    env |= {"PYTHONPATH": f"{lab.parent}:{ROOT}", "XDG_CACHE_HOME": str(lab.parent / "cache")}
+    jobs = [subprocess.Popen([sys.executable, "-c", RUN], env=env, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    told = [json.loads(job.communicate()[0]) for job in jobs]
+    assert [values for values, _ in told] == [[3.0, 2.0, -1.0, 5.0]] * 2
+    folders = lab.parent / "cache" / "rtctl"
+    assert len(list(folders.glob("lab.*/*/*.nbi"))) == len(list(folders.glob("lab.*/*/*.nbc"))) == 5

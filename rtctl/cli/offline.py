@@ -4,11 +4,12 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from rtctl.cli.parser import Commands, command, positive
-from rtctl.errors import EXIT_OK, UsageError
+from rtctl.errors import EXIT_OK, RtctlError, UsageError
 
 
 def add_before(commands: Commands) -> None:
@@ -23,6 +24,9 @@ def add_before(commands: Commands) -> None:
     run.add_argument("--dry", action="store_true", help="compute and log, but send stop frames alone")
     run.add_argument("--lockstep", action="store_true", help="wait for the drives' replies instead of the clock")
     run.add_argument("--timeout", metavar="S", type=positive, help="wait no longer for a vehicle that is not there yet")
+
+    warm = command(commands, "warm", "compile ahead what a robot needs", "rtctl warm configs/panda.toml", _warm)
+    warm.add_argument("config", metavar="CONFIG", nargs="?", default="", help="default: the source tree's panda.toml")
 
 
 def add_after(commands: Commands) -> None:
@@ -69,6 +73,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    _prepare(arguments.config)
     from rtctl.app.daemon import run
 
     return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry, timeout=arguments.timeout)
@@ -76,7 +81,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.app.sim import simulate
+    from rtctl.spec.scenario import load_scenario, robot_file
 
+    _prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
     result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
     if arguments.json:
         print(json.dumps(result))
@@ -85,6 +92,49 @@ def _sim(arguments: argparse.Namespace) -> int:
 
         show(result, arguments.scenario, arguments.log)
     return EXIT_OK
+
+
+def _warm(arguments: argparse.Namespace) -> int:
+    from rtctl import design
+
+    config = arguments.config or str(Path(__file__).parents[2] / "configs" / "panda.toml")
+    if not Path(config).is_file():
+        raise UsageError(f"warm: {config}: no such file, wanted a config")
+    if design.is_base(config):
+        design.load_base(config)
+    else:
+        design.load(config)
+    _prepare(config, strict=True)
+    return EXIT_OK
+
+
+def _prepare(config: str, strict: bool = False) -> None:
+    """Compile what a config's robot needs where that was not done yet, and say so: it takes a while.
+
+    What goes wrong then is left to the command itself to find and to tell, unless strict.
+    """
+    from rtctl.app import warm
+
+    if not Path(config).is_file() or not warm.needed(config):
+        return
+    print("rtctl: compiling what is not compiled yet; it is kept for the next time", file=sys.stderr, flush=True)
+    from rtctl.cli.progress import bar
+
+    total, printed = warm.kernels(), time.monotonic()
+
+    def told(done: int) -> None:
+        nonlocal printed
+        draw(min(done, total))
+        if not sys.stderr.isatty() and time.monotonic() - printed > 5.0:
+            printed = time.monotonic()
+            print(f"rtctl: compiled {done} of about {total} kernels", file=sys.stderr, flush=True)
+
+    try:
+        with bar("compiling", total) as draw:
+            warm.warm(config, told)
+    except RtctlError:
+        if strict:
+            raise
 
 
 def _schema(arguments: argparse.Namespace) -> int:

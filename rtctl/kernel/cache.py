@@ -14,6 +14,7 @@ import os
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -24,6 +25,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
 from rtctl.trust import TrustError, own_folder
 
+PATIENCE = 300.0  # [s] for another process that compiles the same function; then it is compiled here too
 VERSIONS = 8  # of a module's kernels that are kept, the latest used
 
 _FROM = re.compile(rb"^[ \t]*from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -145,18 +147,51 @@ class _Content(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """numba's cache of one function, in a folder named by content; several processes may fill it at once."""
+    """numba's cache of one function, in a folder named by content, that several processes fill without double work.
+
+    Who finds nothing there locks the function and compiles it; others wait for that and load what it made. What a
+    function calls is locked after it, and no kernel calls itself, so nobody waits in a circle.
+    """
 
     _impl_class = _Content
+    _lock = -1  # descriptor, while this process compiles the function
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what was compiled for a signature; None, with the function locked, where nobody did."""
+        load: Any = super().load_overload
+        found = load(sig, target_context)
+        if found is None and self._enabled:
+            self._take()
+            found = load(sig, target_context)
+        if found is not None:
+            self._release()
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save what was compiled; locked, because numba takes a free name from an index that others may be writing."""
-        descriptor = os.open(folder() / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        """Save what was compiled, and let the others have it."""
+        save: Any = super().save_overload
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            save(sig, data)
         finally:
-            os.close(descriptor)
+            self._release()
+
+    def _take(self) -> None:
+        if self._lock < 0:
+            locator: Any = self._impl.locator
+            locator.ensure_cache_path()
+            path = locator.path / f"{self._impl.filename_base}.lock"
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            with suppress(BlockingIOError):
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            time.sleep(0.02)
+
+    def _release(self) -> None:
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
 
 
 def install(dispatcher: Any, function: Callable[..., Any]) -> None:

@@ -1,0 +1,123 @@
+"""Compilation ahead of the first run: two processes that share the kernels between them, told as they go.
+
+The caches of the kernels let each be compiled once: who comes second waits and loads it. So both processes go through
+the same work in another order.
+"""
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numba
+
+from rtctl.errors import RtctlError
+from rtctl.kernel.cache import folder
+from rtctl.spec.base import is_base
+
+POLL = 0.1  # [s]
+KEPT = 50  # marks of what was warmed
+_ROOT = Path(__file__).resolve().parents[1]
+_KERNEL = re.compile(rb"^@(?:ieee_)?kernel\b", re.MULTILINE)
+
+
+def needed(config: str | Path) -> bool:
+    """Return whether no robot of a config's kind was warmed with these sources and this numba."""
+    return not getattr(numba.config, "DISABLE_JIT", False) and not _mark(Path(config)).exists()
+
+
+def kernels() -> int:
+    """Return how many kernels the sources have: no robot needs all of them."""
+    return sum(len(_KERNEL.findall(path.read_bytes())) for path in _ROOT.rglob("*.py"))
+
+
+def warm(config: str | Path, told: Callable[[int], None]) -> None:
+    """Compile what a config's robot needs; `told` is given the number of kernels compiled so far.
+
+    Raises RtctlError where a process failed.
+    """
+    since = time.time()
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(folder())}
+    command = [sys.executable, "-m", "rtctl.app.warm", str(config)]
+    jobs = [
+        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=env)
+        for part in ("robot", "world")
+    ]
+    try:
+        while any(job.poll() is None for job in jobs):
+            told(_made(since))
+            time.sleep(POLL)
+    finally:
+        for job in jobs:
+            if job.poll() is None:
+                job.kill()
+        errors = [(job.communicate()[1] or b"").decode(errors="replace").strip().splitlines() for job in jobs]
+    for job, lines in zip(jobs, errors, strict=True):
+        if job.returncode:
+            raise RtctlError(f"{config}: compilation failed: {lines[-1] if lines else job.returncode}")
+    mark = _mark(Path(config))
+    mark.parent.mkdir(exist_ok=True)
+    for old in sorted(mark.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-KEPT]:
+        old.unlink(missing_ok=True)
+    mark.touch()
+
+
+def _mark(config: Path) -> Path:
+    """Return the file that tells that a robot of this kind was warmed, named by all that decides what is compiled."""
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version} {is_base(config)}".encode())
+    for path in sorted(_ROOT.rglob("*.py")):
+        digest.update(str(path.relative_to(_ROOT)).encode() + b"\0" + path.read_bytes())
+    return folder() / "warm" / digest.hexdigest()[:32]
+
+
+def _made(since: float) -> int:
+    """Return how many kernels were written to the caches since a time [s]."""
+    count = 0
+    for path in folder().glob("rtctl.*/*/*.nbi"):
+        with suppress(OSError):
+            count += path.stat().st_mtime >= since
+    return count
+
+
+def _robot(config: Path) -> None:
+    """Build the robot and let its tick do every kind of work."""
+    from rtctl import design
+
+    if is_base(config):
+        from rtctl.design.rover import build as base_of
+        from rtctl.rover.pipe import warm as warm_base
+
+        warm_base(base_of(design.load_base(config), config))
+    else:
+        from rtctl.arm.pipe import warm as warm_arm
+
+        warm_arm(design.build(design.load(config), config))
+
+
+def _world() -> None:
+    """Measure distances to one obstacle of every type, which needs no robot."""
+    import numpy as np
+
+    from rtctl.types import ObstacleEdit, Shape
+    from rtctl.world import obstacle_table
+    from rtctl.world.primitives import TYPES
+
+    far, upright, size = np.array([0.0, 0.0, 50.0]), np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.1, 2.0])
+    shapes = [Shape(k, k, size, far, upright, np.ones(3), np.ones(3)) for k in TYPES if k not in ("mesh", "cloud")]
+    cloud = np.array([0.1, 1e-3, 0.0, 0.0])
+    shapes.append(Shape("cloud", "cloud", cloud, far, upright, np.ones(3), np.ones(3), cloud=bytes(600)))
+    table, _ = obstacle_table.edited(obstacle_table.empty(), tuple(ObstacleEdit(s.name, s) for s in shapes))
+    obstacle_table.distance_from(table, np.zeros(3))
+    obstacle_table.advanced(table, 1e-3)
+    obstacle_table.oldest(table)
+
+
+if __name__ == "__main__":
+    if sys.argv[2] == "world":
+        _world()
+    _robot(Path(sys.argv[1]))
