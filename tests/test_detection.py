@@ -7,6 +7,7 @@ import pytest
 
 from rtctl.app.servo import Turn
 from rtctl.arm import faults
+from rtctl.arm.law import prepared
 from rtctl.types import F64, Link, Request, State, Verb
 from tests.lab import DOWN, Standing, goal, lab, robot
 
@@ -137,7 +138,7 @@ def test_an_encoder_that_sticks_at_rest_is_seen_by_the_torque_that_moves_its_joi
 
 
 def test_an_arm_that_is_held_while_a_goal_pushes_has_no_stuck_encoder():
-    arm = Standing(arm=robot()._replace(safety=robot().safety._replace(innovation_max=1e9)))
+    arm = Standing(arm=prepared(robot()._replace(safety=robot().safety._replace(innovation_max=1e9))))
     arm.tick(Request(goal=goal(arm.memory, [0.5, 0.3, 0.5])))
     arm.ticks(300)
     assert np.abs(arm.memory.qdd * np.diag(arm.memory.model.A))[4] > arm.robot.safety.friction[4]

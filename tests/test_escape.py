@@ -83,7 +83,7 @@ def fly(obstacles: Obstacles, seconds: float, escaping: bool = True) -> Flight:
         elif s.phase != Phase.NONE:
             s = escape.advanced(s, e, push, bool(np.linalg.norm(xd) < 0.01), DT)
         if s.active:
-            e = escape.way(s, push, MOTION)
+            e = escape.way(s.n, s.b, push, MOTION)
         d = float(np.linalg.norm(e))
         wanted = e / max(d, 1e-9) * approach_speed(d, MOTION.k_p / MOTION.k_v, MOTION.v_max, MOTION.a_max)
         step = wanted - v_ref
@@ -145,7 +145,7 @@ def test_an_escape_stays_along_the_axes_that_the_goal_asks_for():
         return s
 
     s = chosen(escape.begun(Escape(), 1.0, push), plane)
-    way = escape.way(s, push, MOTION)
+    way = escape.way(s.n, s.b, push, MOTION)
     assert s.phase == Phase.FIRST
     assert abs(way[2]) < 1e-12
     assert abs(way @ push) < 0.4 * np.linalg.norm(way) * np.linalg.norm(push)
@@ -161,7 +161,7 @@ def test_no_second_escape_begins_where_the_first_one_did(d: float):
 
 def test_the_circulation_is_across_the_push_and_at_its_speed():
     s = Escape(Phase.FIRST, 1.0, EYE[0], EYE[2])
-    way = escape.way(s, 5.0 * EYE[0], MOTION)
+    way = escape.way(s.n, s.b, 5.0 * EYE[0], MOTION)
     u = way / np.linalg.norm(way)
     assert u @ np.cross(EYE[2], EYE[0]) > 0.9
     assert -0.4 < u @ EYE[0] < 0.0

@@ -60,10 +60,10 @@ def test_a_goal_inside_an_obstacle_is_refused_by_its_name_and_one_on_the_surface
 
 def test_arrived_means_within_both_tolerances_and_slow():
     near = STUCK._replace(error=0.0029, error_rot=0.0149, speed=0.04, rate=0.1)
-    assert arrived(near, goal())
+    assert arrived(near, 0.003, 0.015)
     changes: list[dict[str, Any]] = [{"error": 0.0031}, {"error_rot": 0.0151}, {"speed": 0.06}, {"rate": 0.3}]
     for change in changes:
-        assert not arrived(near._replace(**change), goal())
+        assert not arrived(near._replace(**change), 0.003, 0.015)
 
 
 def test_at_rest_is_slow_in_both():

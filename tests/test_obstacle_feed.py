@@ -17,6 +17,7 @@ from firmware_sim.simulator import open_simulator
 from rtctl import design as cfg
 from rtctl.app.servo import first_feedback
 from rtctl.app.sim import simulate
+from rtctl.arm.law import prepared
 from rtctl.arm.pipe import initial, tick
 from rtctl.cli import main
 from rtctl.errors import ConfigError, RequestError
@@ -134,7 +135,7 @@ def test_an_observation_widens_with_its_age_until_it_is_stale_and_not_beyond() -
 
 def test_the_field_sees_the_margin_and_contact_does_not() -> None:
     """A ball beside the tip, observed some time ago: repelled as if nearer; grown into the arm it is no contact."""
-    arm = Standing(arm=robot()._replace(safety=robot().safety._replace(creep=0.3)))
+    arm = Standing(arm=prepared(robot()._replace(safety=robot().safety._replace(creep=0.3))))
     points = robot().points
     P = robot().body.evaluate(PANDA_HOME, np.zeros(7), points).P[: len(points.radius)]
     j = int(P[:, 0].argmax())

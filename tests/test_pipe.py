@@ -17,6 +17,7 @@ from msgspec.structs import astuple
 from rtctl import design as cfg
 from rtctl.app.servo import first_feedback
 from rtctl.app.sim import simulate
+from rtctl.arm.law import prepared
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial, tick, warm
 from rtctl.hal.clock import lockstep
@@ -226,7 +227,7 @@ def test_a_log_holds_all_that_went_in(tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(("servo", "model"), [(1000, 1000), (1000, 250), (225, 100), (500, 30)])
 def test_the_model_is_evaluated_at_its_own_rate(servo: int, model: int):
-    arm = robot()._replace(dt=1.0 / servo, model_dt=1.0 / model)
+    arm = prepared(robot()._replace(dt=1.0 / servo, model_dt=1.0 / model))
     memory = at_rest(arm, PANDA_HOME)
     evaluated = []
     for k in range(servo):

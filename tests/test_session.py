@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rtctl.arm import session
+from rtctl.arm.law import prepared
 from rtctl.arm.session import EVENT_OF, SETTLE
 from rtctl.control import supervisor
 from rtctl.types import Drive, ObstacleEdit, Request, Severity, State, Task, Verb
@@ -28,7 +29,7 @@ def swing(arm: Standing, ticks: int) -> None:
 
 def idle(q: np.ndarray = PANDA_HOME) -> Standing:
     """Return an arm whose estimator is not surprised that it moves without getting anywhere."""
-    arm = Standing(State.IDLE, q, robot()._replace(safety=robot().safety._replace(innovation_max=1e9)))
+    arm = Standing(State.IDLE, q, prepared(robot()._replace(safety=robot().safety._replace(innovation_max=1e9))))
     arm.tick()
     return arm
 

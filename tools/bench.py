@@ -34,16 +34,13 @@ from tools import bench_log, bench_turn
 from tools.bench_rig import Arm, BoundFloor, Case, Floor, case, request, robot_and_spec
 from tools.bench_rows import Row, row, timed
 
-# The blocks of the tick, in order: function of rtctl.arm.pipe -> name of the row.
+# The parts of the tick: function of rtctl.arm.pipe -> name of the row; all but the first two run when they must.
 STAGES = {
-    "_estimated": "estimate",
-    "_perceived": "perceive",
-    "detected": "detect",
-    "supervised": "supervise",
-    "_law": "law",
-    "_commanded": "command",
+    "servo": "servo level, a call",
+    "_evaluated": "parameter level",
+    "_perceived": "edit obstacles",
+    "_decided": "supervise, take goals",
     "_diagnosed": "diagnose",
-    "_record": "record",
 }
 FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000, "log": 10, "demo": 60}
 QUICK = {"law": 20, "tick": 60, "call": 20, "wake": 20, "log": 1, "demo": 1}
@@ -131,7 +128,8 @@ def ticks(robot: Robot, count: int) -> Iterator[Row]:
     with staged() as times:
         _session(robot, count)
     for name, label in STAGES.items():
-        yield row("tick", label, times[name])
+        if times[name]:
+            yield row("tick", label, times[name])
 
 
 def _session(robot: Robot, count: int) -> tuple[I64, np.ndarray]:

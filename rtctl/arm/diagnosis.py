@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm.field import Field, own_field
-from rtctl.arm.law import Law
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.task import error_of, selected, task_error
@@ -69,16 +68,19 @@ def held(b: Balance) -> Held:
     return Held(Status.LOCAL_MINIMUM, 0, -1)
 
 
-def balance(robot: Robot, m: Memory, law: Law, tau_wanted: F64) -> Balance:
-    """Return the balance of this tick; `law` must be its law, for the field's work arrays are read."""
+def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balance:
+    """Return the balance of the tick that ends with m, for the field's work arrays are read.
+
+    tau_limits (n,) [Nm] of its law; tau_wanted (n,) [Nm] its sum.
+    """
     assert m.goal is not None
     e, _ = task_error(int(m.goal.task), m.goal.axis, m.goal.position, m.goal.wxyz, m.tip.x, m.tip.R)
     tau_own, _, _ = own_field(
         m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
     )
     obstacles, limits, own, granted = _shares(
-        _drive(robot, m, law), m.model.J, m.model.A_inv, m.space.Lambda, m.model.Jp, robot.points.link, robot.scratch,
-        tau_own, law.tau_obstacles, law.tau_limits, m.joints.q, robot.q_min, robot.q_max, robot.limit.rho0,
+        _drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda, m.model.Jp, robot.points.link, robot.scratch,
+        tau_own, m.tau_obstacles, tau_limits, m.joints.q, robot.q_min, robot.q_max, robot.limit.rho0,
     )  # fmt: skip
     return Balance(
         obstacles, limits, own, granted, np.abs(tau_wanted) / robot.tau_max, m.goal_rho, robot.avoid.rho0,
@@ -86,10 +88,10 @@ def balance(robot: Robot, m: Memory, law: Law, tau_wanted: F64) -> Balance:
     )  # fmt: skip
 
 
-def _drive(robot: Robot, m: Memory, law: Law) -> F64:
+def _drive(robot: Robot, m: Memory) -> F64:
     """Return the tip's acceleration (6,) that the goal asks for, zero along what it leaves free."""
     assert m.goal is not None
-    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, law.v_ref, law.w_ref)
+    v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, m.v_ref, m.w_ref)
     return robot.motion.k_v * np.concatenate((v, w))
 
 
@@ -154,7 +156,7 @@ def at_edge(J: F64, e: F64) -> bool:
     return bool(largest <= EDGE)
 
 
-def names(robot: Robot, m: Memory, law: Law, found: Held) -> tuple[str, ...]:
+def names(robot: Robot, m: Memory, found: Held) -> tuple[str, ...]:
     """Return what holds the arm in words, the strongest first."""
     bits = [i for i in range(64) if found.mask >> i & 1]
     order = sorted(bits, key=lambda i: i != found.main)
@@ -164,7 +166,7 @@ def names(robot: Robot, m: Memory, law: Law, found: Held) -> tuple[str, ...]:
         case Status.SATURATED:
             return tuple(robot.joints[i] for i in order)
         case Status.SINGULAR | Status.UNREACHABLE:
-            return (_lost(robot, m, law, found.status),)
+            return (_lost(robot, m, found.status),)
         case Status.LOCAL_MINIMUM if not order:
             pair = int(m.model.own_rho.argmin()) if len(m.model.own_rho) else -1
             near = pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0
@@ -178,10 +180,10 @@ def _link(robot: Robot, k: int) -> str:
     return robot.points.names[int(robot.scratch.pairs[k, 5].argmax())]
 
 
-def _lost(robot: Robot, m: Memory, law: Law, status: Status) -> str:
+def _lost(robot: Robot, m: Memory, status: Status) -> str:
     """Return the direction that the joints do not give the tip: the wanted acceleration less what it gets."""
     assert m.goal is not None
-    F = _drive(robot, m, law)
+    F = _drive(robot, m)
     miss = F - matvec(m.model.J, matvec(m.model.A_inv, tmatvec(m.model.J, matvec(m.space.Lambda, F))))
     v, w = selected(int(m.goal.task), m.goal.axis, m.tip.R, miss[:3], miss[3:])
     linear = status == Status.UNREACHABLE or norm(v) > robot.motion.length * norm(w)

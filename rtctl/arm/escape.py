@@ -46,10 +46,13 @@ class Phase(IntEnum):
     GIVEN_UP = 4
 
 
+_NONE, _FIRST, _OTHER, _GIVEN_UP = (int(p) for p in (Phase.NONE, Phase.FIRST, Phase.OTHER, Phase.GIVEN_UP))
+
+
 class Escape(NamedTuple):
     """One escape; the values of an older one stay for the progress test."""
 
-    phase: Phase = Phase.NONE
+    phase: int = Phase.NONE  # a Phase; compiled code gives its number
     hit: float = np.inf  # [m] to the goal where it began: later ones must begin nearer
     n: F64 = np.zeros(3)  # the last direction of the push
     b: F64 = np.zeros(3)  # axis of the circulation
@@ -70,45 +73,67 @@ def begun(old: Escape, d: float, push: F64) -> Escape:
     return Escape(Phase.CHOOSING, d, push / max(norm(push), 1e-12))
 
 
+@kernel
+def push_along(model: Model, tau_obstacles: F64, task: int, axis: F64) -> F64:
+    """Return `push_of` a goal with this task and axis (3,) of the tool."""
+    a = matvec(model.J, matvec(model.A_inv, tau_obstacles))
+    return selected(task, axis, model.R, a[:3], a[3:])[0]
+
+
 def push_of(model: Model, tau_obstacles: F64, goal: Goal) -> F64:
     """Return the acceleration (3,) [m/s2] that the obstacles' torque (n,) [Nm] gives the tip where the goal is asked.
 
     Along what the goal leaves free the tip is sent nowhere, so that an escape along it would be none.
     """
-    a = matvec(model.J, matvec(model.A_inv, tau_obstacles))
-    return selected(int(goal.task), goal.axis, model.R, a[:3], a[3:])[0]
+    return push_along(model, np.ascontiguousarray(tau_obstacles), int(goal.task), goal.axis)
+
+
+@kernel
+def advance(s: Escape, e: F64, push: F64, still: bool, dt: float) -> Escape:
+    """Return the escape a tick later.
+
+    s: with its phase as an integer. e (3,) [m] to the goal; push (3,) [m/s2] of the obstacles on the tip; still: the
+    tip is at rest.
+    """
+    d, a = norm(e), norm(push)
+    if s.phase == _GIVEN_UP:
+        return Escape(_NONE if d < s.hit - GAIN else _GIVEN_UP, s.hit, s.n, s.b, s.costs, s.ticks, s.slow)
+    if s.phase != _FIRST and s.phase != _OTHER:
+        return s
+    ticks, slow, n = s.ticks + 1, s.slow + 1 if still else 0, push / a if a > FELT else s.n
+    if d < s.hit - GAIN and (a <= FELT or _dot(push, e) > OPPOSED * a * d):
+        return Escape(_NONE, s.hit, n, s.b, s.costs, ticks, slow)
+    bound = SIDE_TIME if s.phase == _FIRST else 2.0 * SIDE_TIME
+    back = s.phase == _OTHER and ticks * dt < SIDE_TIME  # it begins where the first side ended
+    if ticks * dt < bound and slow * dt < SLOW and (back or d < s.hit + EXCURSION):
+        return Escape(s.phase, s.hit, n, s.b, s.costs, ticks, slow)
+    if s.phase == _FIRST:
+        return Escape(_OTHER, s.hit, n, -s.b, s.costs, 0, 0)
+    return Escape(_GIVEN_UP, s.hit, n, s.b, s.costs, 0, 0)
 
 
 def advanced(s: Escape, e: F64, push: F64, still: bool, dt: float) -> Escape:
-    """Return the escape a tick later.
+    """Return `advance` of an escape whose phase is a Phase."""
+    s = advance(s._replace(phase=int(s.phase)), e, push, bool(still), dt)
+    return s._replace(phase=Phase(s.phase))
 
-    e (3,) [m] to the goal; push (3,) [m/s2] of the obstacles on the tip; still: the tip is at rest.
+
+@kernel
+def way(n: F64, b: F64, push: F64, motion: MotionParams) -> F64:
+    """Return the error (3,) [m] that sends the tip at SPEED v_max across the push and a little against it.
+
+    n, b (3,): of the Escape; push (3,) [m/s2].
     """
-    d, a = norm(e), norm(push)
-    if s.phase == Phase.GIVEN_UP:
-        return s._replace(phase=Phase.NONE) if d < s.hit - GAIN else s
-    if not s.active:
-        return s
-    s = s._replace(ticks=s.ticks + 1, slow=s.slow + 1 if still else 0, n=push / a if a > FELT else s.n)
-    if d < s.hit - GAIN and (a <= FELT or _dot(push, e) > OPPOSED * a * d):
-        return s._replace(phase=Phase.NONE)
-    bound = SIDE_TIME if s.phase == Phase.FIRST else 2.0 * SIDE_TIME
-    back = s.phase == Phase.OTHER and s.ticks * dt < SIDE_TIME  # it begins where the first side ended
-    if s.ticks * dt < bound and s.slow * dt < SLOW and (back or d < s.hit + EXCURSION):
-        return s
-    if s.phase == Phase.FIRST:
-        return s._replace(phase=Phase.OTHER, b=-s.b, ticks=0, slow=0)
-    return s._replace(phase=Phase.GIVEN_UP, ticks=0, slow=0)
-
-
-def way(s: Escape, push: F64, motion: MotionParams) -> F64:
-    """Return the error (3,) [m] that sends the tip at SPEED v_max across the push and a little against it."""
     inward = PRESS if norm(push) > FELT else WRAP
-    t = np.cross(s.b, s.n) - inward * s.n
+    t = np.empty(3)
+    t[0] = b[1] * n[2] - b[2] * n[1] - inward * n[0]
+    t[1] = b[2] * n[0] - b[0] * n[2] - inward * n[1]
+    t[2] = b[0] * n[1] - b[1] * n[0] - inward * n[2]
     v, k = SPEED * motion.v_max, motion.k_p / motion.k_v
     knee = motion.a_max / (k * k)
     length = v / k if v <= k * knee else 0.5 * (v * v / motion.a_max + knee)  # the inverse of osc.approach_speed
-    return t * (length / max(norm(t), 1e-12))
+    out: F64 = t * (length / max(norm(t), 1e-12))
+    return out
 
 
 def chosen(

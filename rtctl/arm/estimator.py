@@ -136,7 +136,7 @@ def joint_step(
     replies: (n,) measurements that this cycle brought of each joint; those without coast, with innovation 0.
     """
     noise = (params.sigma_qdd, params.r_q, params.r_qd)
-    *fields, innovation = _joint_step(*est, qdd, q, qd, age, replies, dt, *noise, params.has_qd)
+    *fields, innovation = filter_joints(*est, qdd, q, qd, age, replies, dt, *noise, params.has_qd)
     return JointEstimate(*fields), innovation
 
 
@@ -238,7 +238,7 @@ def _update_pose(
 
 
 @kernel
-def _joint_step(
+def filter_joints(
     q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, replies: I64 | B1, dt: float,
     sigma_qdd: F64, r_q: F64, r_qd: F64, has_qd: bool,
 ) -> tuple[F64, F64, F64, F64]:  # fmt: skip
@@ -264,3 +264,28 @@ def _joint_step(
             for c in range(2):
                 P1[i, r, c] = C[r, c]
     return q1, qd1, P1, innovation
+
+
+@kernel
+def predict_tip(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64, J: F64, Jdqd: F64, qdd: F64, dt: float, p: EstimatorParams
+) -> tuple[F64, F64, F64, F64, F64, F64]:  # fmt: skip
+    """Return the fields of a TipEstimate dt [s] later, by the acceleration J qdd + Jdqd."""
+    a = matvec(J, qdd) + Jdqd
+    return _predict(x, xd, P, R, omega, P_rot, a[:3], a[3:], dt, p.sigma_a, p.sigma_alpha)
+
+
+@kernel
+def correct_by_twist(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64, twist: F64, p: EstimatorParams
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:
+    """Return the fields of a TipEstimate after `update_velocity` with a twist (6,), and its innovation."""
+    return _update_velocity(x, xd, P, R, omega, P_rot, twist[:3], twist[3:], p.r_v, p.r_omega)
+
+
+@kernel
+def correct_by_pose(
+    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64, x_measured: F64, R_measured: F64, p: EstimatorParams
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:
+    """Return the fields of a TipEstimate after `update_pose` with a pose of this instant, and its innovation."""
+    return _update_pose(x, xd, P, R, omega, P_rot, x_measured, R_measured, 0.0, p.r_x, p.r_rot)

@@ -11,7 +11,6 @@ import numpy as np
 from rtctl.arm import detection
 from rtctl.control.faults import Fault, latch_with
 from rtctl.kernel import kernel
-from rtctl.kernel.reductions import any_set
 from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
 JUMP_WINDOW = 50  # cycles in which a second jump makes a fault of a glitch
@@ -58,7 +57,12 @@ FAULTS = (
 INDEX = {fault.name: i for i, fault in enumerate(FAULTS)}
 BIT = {fault.name: 1 << i for i, fault in enumerate(FAULTS)}
 REFUSES_ARMING = ~BIT["duplicate_reply"]  # every other fault, while present, refuses arming
-_AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
+AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
+STOPS, BRAKES = (  # bits of the faults that ask for SS2 or more: those that an operator must reset, and all
+    sum(1 << i for i, fault in enumerate(FAULTS) if fault.severity >= Severity.SS2 and fault.clear in clear)
+    for clear in ("RL", "ARL")
+)
+_DISABLED, _TORQUE, _JUMPS = detection.DISABLED, detection.TORQUE, (1 << JUMP_WINDOW) - 1
 _CORRUPT, _SEND_FAILED, _DERATED = (
     int(Link.CORRUPT),
     int(Link.SEND_FAILED),
@@ -77,6 +81,40 @@ _BY_LINK = tuple(
         (Link.LOG_DEGRADED, "log_degraded"),
     )
 )
+
+
+class _Bits(NamedTuple):
+    """The bits of the faults that `detect` finds in the evidence, as compiled code reads them."""
+
+    feedback_stale: int = BIT["feedback_stale"]
+    feedback_lost: int = BIT["feedback_lost"]
+    corrupt_frames: int = BIT["corrupt_frames"]
+    send_failed: int = BIT["send_failed"]
+    drive_fault: int = BIT["drive_fault"]
+    drive_disabled: int = BIT["drive_disabled"]
+    torque_mismatch: int = BIT["torque_mismatch"]
+    encoder_stuck: int = BIT["encoder_stuck"]
+    velocity_mismatch: int = BIT["velocity_mismatch"]
+    encoder_jump: int = BIT["encoder_jump"]
+    not_finite: int = BIT["not_finite"]
+    deadline: int = BIT["deadline"]
+    goal_in_obstacle: int = BIT["goal_in_obstacle"]
+    contact: int = BIT["contact"]
+    feed_stale: int = BIT["feed_stale"]
+    outside_limits: int = BIT["outside_limits"]
+    overspeed: int = BIT["overspeed"]
+    innovation: int = BIT["innovation"]
+
+
+_B = _Bits()
+
+
+class Bounds(NamedTuple):
+    """The bounds of SafetyParams that compare with one number of the evidence."""
+
+    stale_periods: float
+    lost_periods: float
+    feed_timeout: float  # [s]
 
 
 class SafetyParams(NamedTuple):
@@ -103,7 +141,7 @@ class Evidence(NamedTuple):
     missed: int  # slots
     active: bool  # drives are meant to be enabled
     powered: bool  # torque flows, or is being switched on
-    jumped: bool  # a joint's position was dropped: further than it can have moved
+    jumped: bool  # a joint's position was implausible: further than it can have moved
     pulled: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
@@ -128,7 +166,7 @@ class Counters(NamedTuple):
 def jumped(
     q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
 ) -> B1:
-    """Return which joints (n,) report a position [rad] that they cannot have reached since the last one believed.
+    """Return which joints (n,) report a position [rad] that they cannot have reached since the last plausible one.
 
     q_previous was `age_previous` [s] old `elapsed` [s] ago, q is `age` [s] old now; dt [s] is the servo period.
     """
@@ -140,54 +178,85 @@ def jumped(
     return out
 
 
-def detect(link: int, e: Evidence, c: Counters, p: SafetyParams, dt: float) -> tuple[int, Counters]:
-    """Return the bits of the faults present at this tick and the counters for the next; link: types.Link of it."""
-    seen, active = e.seen, e.active
-    half = 0.5 * dt  # ages are whole periods; half a one keeps rounding out of the comparison
-    n = Counters(
-        ((c.corrupt_window << 1) | bool(link & _CORRUPT)) & 0x3FF,
-        c.send_failed + 1 if link & _SEND_FAILED else 0,
-        c.disabled + 1 if active and seen & detection.DISABLED else 0,
-        c.mismatch + 1 if active and seen & detection.TORQUE else 0,
-        c.pulled + 1 if active and e.pulled and not link & _DERATED else 0,
-        ((c.jumps << 1) | e.jumped) & ((1 << JUMP_WINDOW) - 1) if active else 0,
-        c.missed + 1 if e.missed else 0,
-        c.innovation + 1 if active and not e.innovation <= p.innovation_max else 0,
-    )
-    present = {
-        "feedback_stale": e.age > p.stale_periods * dt + half,
-        "feedback_lost": e.age > p.lost_periods * dt + half or seen & detection.UNHEARD,
-        "corrupt_frames": n.corrupt_window.bit_count() >= 3,
-        "send_failed": n.send_failed >= 2,
-        "drive_fault": seen & detection.FAULT,
-        "drive_disabled": n.disabled >= 5,
-        "torque_mismatch": n.mismatch >= 5 or n.pulled >= 5,
-        "encoder_stuck": seen & detection.STUCK,
-        "velocity_mismatch": seen & detection.DISAGREE,
-        "encoder_jump": n.jumps.bit_count() >= 2,
-        "not_finite": e.not_finite or seen & detection.NOT_FINITE,
-        "deadline": e.powered and (n.missed >= 3 or e.missed >= 10),
-        "goal_in_obstacle": e.has_goal and seen & detection.GOAL_INSIDE,
-        "contact": active and seen & detection.CONTACT,
-        "feed_stale": e.feed_age > p.feed_timeout,
-        "outside_limits": active and seen & detection.OUTSIDE and not e.armed_outside,
-        "overspeed": active and seen & detection.FAST,
-        "innovation": n.innovation >= 5,
-    }
-    bits = 0
-    if any(present.values()):
-        bits = sum(BIT[name] for name, here in present.items() if here)
-    if link:
-        bits |= sum(bit for flag, bit in _BY_LINK if link & flag)
-    return bits, n
+@kernel
+def _count(bits: int) -> int:
+    """Return how many bits are set."""
+    count = 0
+    while bits:
+        bits &= bits - 1
+        count += 1
+    return count
 
 
 @kernel
-def any_jumped(
-    q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
-) -> bool:
-    """Return whether `jumped` is true of any joint."""
-    return any_set(jumped(q, age, replies, q_previous, age_previous, qd_max, elapsed, dt))
+def _grown(count: int, here: bool) -> int:
+    """Return how many ticks running something is there."""
+    return count + 1 if here else 0
+
+
+@kernel
+def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Counters:
+    """Return the counters after a tick; link: types.Link of it."""
+    seen, active = e.seen, e.active
+    corrupt = 1 if link & _CORRUPT else 0
+    return Counters(
+        ((c.corrupt_window << 1) | corrupt) & 0x3FF,
+        _grown(c.send_failed, link & _SEND_FAILED != 0),
+        _grown(c.disabled, active and seen & _DISABLED != 0),
+        _grown(c.mismatch, active and seen & _TORQUE != 0),
+        _grown(c.pulled, active and e.pulled and link & _DERATED == 0),
+        ((c.jumps << 1) | (1 if e.jumped else 0)) & _JUMPS if active else 0,
+        _grown(c.missed, e.missed != 0),
+        _grown(c.innovation, active and not e.innovation <= innovation_max),
+    )
+
+
+@kernel
+def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
+    """Return the bits of the faults present at this tick; link: types.Link of it; n: the counters with it counted."""
+    seen, active = e.seen, e.active
+    half = 0.5 * dt  # ages are whole periods; half a one keeps rounding out of the comparison
+    bits = 0
+    if e.age > p.stale_periods * dt + half:
+        bits |= _B.feedback_stale
+    if e.age > p.lost_periods * dt + half or seen & detection.UNHEARD:
+        bits |= _B.feedback_lost
+    if _count(n.corrupt_window) >= 3:
+        bits |= _B.corrupt_frames
+    if n.send_failed >= 2:
+        bits |= _B.send_failed
+    if seen & detection.FAULT:
+        bits |= _B.drive_fault
+    if n.disabled >= 5:
+        bits |= _B.drive_disabled
+    if n.mismatch >= 5 or n.pulled >= 5:
+        bits |= _B.torque_mismatch
+    if seen & detection.STUCK:
+        bits |= _B.encoder_stuck
+    if seen & detection.DISAGREE:
+        bits |= _B.velocity_mismatch
+    if _count(n.jumps) >= 2:
+        bits |= _B.encoder_jump
+    if e.not_finite or seen & detection.NOT_FINITE:
+        bits |= _B.not_finite
+    if e.powered and (n.missed >= 3 or e.missed >= 10):
+        bits |= _B.deadline
+    if e.has_goal and seen & detection.GOAL_INSIDE:
+        bits |= _B.goal_in_obstacle
+    if active and seen & detection.CONTACT:
+        bits |= _B.contact
+    if e.feed_age > p.feed_timeout:
+        bits |= _B.feed_stale
+    if active and seen & detection.OUTSIDE and not e.armed_outside:
+        bits |= _B.outside_limits
+    if active and seen & detection.FAST:
+        bits |= _B.overspeed
+    if n.innovation >= 5:
+        bits |= _B.innovation
+    for flag, bit in _BY_LINK:
+        if link & flag:
+            bits |= bit
+    return bits
 
 
 def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:
@@ -195,7 +264,7 @@ def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:
 
     A fault with clear rule A stays in force until it was absent for GOOD_TICKS; R and L stay until `cleared`.
     """
-    return latch_with(present, latched, good, _AUTOMATIC)
+    return latch_with(present, latched, good, AUTOMATIC)
 
 
 def cleared(in_force: int, present: int) -> int:
@@ -214,7 +283,7 @@ def severity(bits: int) -> Severity:
 
 def stops(bits: int) -> Severity:
     """Return the worst reaction among the faults that an operator must reset: these leave RUN for good."""
-    return severity(bits & ~_AUTOMATIC)
+    return severity(bits & ~AUTOMATIC)
 
 
 def names(bits: int) -> tuple[str, ...]:

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.arm.escape import STALL
 from rtctl.arm.field import CAPPED, Field, FieldParams, LimitParams, field, joint_limit_field, own_field
+from rtctl.arm.flat import field_in, field_sizes
 from rtctl.arm.guards import approach_rows, fitting, guarded, joint_bounds, tip_row, yielding
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
@@ -22,6 +24,12 @@ from rtctl.world.primitives import Obstacles
 _CAP, _SPEED, _SINGULAR = (int(c) for c in (Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR))
 _SCALED = int(Cut.MOTION_SCALED)
 
+
+REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
+_BARE = (  # of Robot
+    "q_min", "q_max", "qd_max", "tau_max", "tau_rate", "tau_lsb", "braking", "viscous", "q_rest", "dt", "model_dt",
+    "carry", "escape",
+)  # fmt: skip
 
 # rows of Law.torques, (7, n) [Nm]; the first five as the record has them
 MOTION = 0
@@ -168,16 +176,30 @@ def prepared(robot: Robot) -> Robot:
         "avoid": robot.avoid,
         "own": robot.self_avoid,
         "limit": robot.limit,
+        "estimator": robot.estimator,
+        "joint": robot.joint_filter,
+        "safety": robot.safety,
+        "stop": robot.stop,
     }
     values = {f"{group}_{k}": v for group, params in groups.items() for k, v in params._asdict().items()}
-    values |= {k: getattr(robot, k) for k in ("q_min", "q_max", "qd_max", "tau_max", "tau_rate", "braking", "dt")}
-    constants = np.zeros(1, [(k, np.float64, (JOINTS_MAX,) * np.ndim(v)) for k, v in values.items()])
+    values |= {k: getattr(robot, k) for k in _BARE}
+    values |= {
+        "axes": int(robot.axes),
+        "escape_ticks": round(STALL / robot.dt),
+        "review_ticks": round(REVIEW / robot.dt),
+    }
+    constants = np.zeros(
+        1, np.dtype((np.record, [(k, np.float64, (JOINTS_MAX,) * np.ndim(v)) for k, v in values.items()]))
+    )
     for k, v in values.items():
         if np.ndim(v):
             constants[k][0, : robot.n] = v
         else:
             constants[k] = v
-    return robot._replace(constants=constants)
+    m = len(robot.points.radius)
+    reals, wholes = field_sizes(robot.slots, m, robot.n)
+    work = np.zeros(reals), np.zeros(wholes, np.int64)
+    return robot._replace(constants=constants, work=work, scratch=field_in(*work, robot.n, m))
 
 
 @kernel

@@ -1,75 +1,280 @@
-"""What one tick leaves to the next: all of the controller's state, as one value."""
+"""What one tick leaves to the next: all of the controller's state, as one value.
+
+What the servo level needs is one flat record of a fixed layout, `HOT`, so that it crosses into compiled code as one
+argument and its bytes are the checkpoint's. Beside it stand what changes seldom: the model, the obstacles, words.
+"""
 
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from rtctl.arm.escape import Escape
+from rtctl.arm.escape import DIRECTIONS, Escape, Phase
 from rtctl.arm.estimator import JointEstimate, TipEstimate
-from rtctl.arm.faults import Counters
+from rtctl.arm.faults import FAULTS, Counters
+from rtctl.arm.flat import AGE, GOAL_RHO, MARGIN, RHO, model_in, row_of, shapes_of, table_of
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
-from rtctl.types import F64, I64, Goal, Severity, State, Status, Task
+from rtctl.arm.robot import JOINTS_MAX
+from rtctl.types import F64, Goal, Record, Severity, State, Status, Task
 from rtctl.world.obstacle_table import World
+
+FAULTS_MAX = 64  # bits of a word
+_JOINT, _INT, _REAL = (JOINTS_MAX,), "<i8", "<f8"
+
+# One layout whatever the arm: arrays over joints are padded; see `law.prepared`.
+HOT = np.dtype(
+    (
+        np.record,
+        [
+            ("tick", _INT),
+            # supervisor
+            ("state", _INT),  # types.State
+            ("since", _INT),  # tick of entering the state
+            ("reaction", _INT),  # types.Severity of SAFE_STOP and FAULT, NONE elsewhere
+            ("off", _INT),  # SAFE_STOP has cut the torque and will not give it back
+            ("present", _INT),  # bits of the faults seen this tick
+            ("in_force", _INT),  # bits of the faults
+            ("good", _INT, (FAULTS_MAX,)),  # ticks since each was present
+            ("counters", _INT, (len(Counters._fields),)),
+            ("clear_until", _INT),  # tick until which latched drive faults are being cleared
+            ("recovering", _INT),  # armed outside the joint limits, on request
+            ("outside", _INT),  # a joint is beyond its limits
+            ("leaving", _INT),  # SIGTERM came
+            ("done", _INT),  # nothing more to do: the daemon may leave
+            # estimates
+            ("q", _REAL, _JOINT),  # [rad]
+            ("qd", _REAL, _JOINT),  # [rad/s]
+            ("P", _REAL, (JOINTS_MAX, 2, 2)),  # covariance of (q, qd)
+            ("x", _REAL, (3,)),  # [m] the tip
+            ("xd", _REAL, (3,)),  # [m/s]
+            ("P_tip", _REAL, (2, 2)),
+            ("R", _REAL, (3, 3)),
+            ("omega", _REAL, (3,)),  # [rad/s]
+            ("P_rot", _REAL, (2, 2)),
+            ("innovation", _REAL),  # normalised, largest of this tick
+            ("task", _INT),  # types.Task that `space` was evaluated for
+            ("axis", _REAL, (3,)),  # of the tool that goes with it
+            ("evaluated", _INT),  # the model, this tick
+            ("phase", _REAL),  # model periods since the last evaluation was due, in (-1, 0]
+            ("qdd", _REAL, _JOINT),  # [rad/s2] predicted from the torque of the last command
+            ("q_previous", _REAL, _JOINT),  # [rad] of the last feedback
+            ("age_previous", _REAL, _JOINT),  # [s] how old it was
+            ("watch", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.watched`
+            ("rest", _INT),  # ticks all joints have been at rest
+            # task
+            ("has_goal", _INT),
+            ("goal", _REAL, (3,)),  # as types.Goal
+            ("goal_wxyz", _REAL, (4,)),
+            ("goal_task", _INT),
+            ("goal_tolerance", _REAL),
+            ("goal_tolerance_rot", _REAL),
+            ("goal_axis", _REAL, (3,)),
+            ("has_posture", _INT),
+            ("goal_posture", _REAL, _JOINT),
+            ("hold", _REAL, (3,)),  # where the tip stays without a goal
+            ("hold_wxyz", _REAL, (4,)),
+            ("hold_task", _INT),
+            ("hold_axis", _REAL, (3,)),
+            ("hold_tolerance", _REAL),
+            ("hold_tolerance_rot", _REAL),
+            ("q_rest", _REAL, _JOINT),  # [rad] posture of the hold
+            ("v_ref", _REAL, (3,)),  # [m/s]
+            ("w_ref", _REAL, (3,)),  # [rad/s]
+            ("status", _INT),  # types.Status
+            ("blocker", _INT),  # obstacle slot or joint index that holds the arm most, -1 for none
+            ("holders", "<u8"),  # bits of all that hold it
+            ("escape_phase", _INT),  # as escape.Escape
+            ("escape_hit", _REAL),
+            ("escape_n", _REAL, (3,)),
+            ("escape_b", _REAL, (3,)),
+            ("escape_costs", _REAL, (DIRECTIONS,)),
+            ("escape_ticks", _INT),
+            ("escape_slow", _INT),
+            ("still", _INT),  # ticks the tip has been at rest
+            ("nearest", _REAL),  # [s] at full speed: the least that the goal was away
+            ("idle", _REAL),  # [s] for which it has not come nearer; see `progress.idle`
+            # torque
+            ("tau_obstacles", _REAL, _JOINT),  # [Nm] of the last tick
+            ("sent", _REAL, (4, JOINTS_MAX)),  # [Nm] the last commands, newest first
+            ("cut", _INT),  # types.Cut of the last tick
+            ("pulled", _INT),  # the slew starts from the echo: the drive does not give what it is sent
+            ("pace", _REAL),  # fraction of qd_max that joints may have
+        ],
+    )
+)
+_NAMES = frozenset(HOT.names or ())
+_COLD = ("hot", "n", "verdict", "held", "model", "parameters", "placed", "table", "shapes")
+_JOINTS = ("qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
+_FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "pulled")
+_ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """Everything a tick knows of the past: a value as the named tuples are, copied eight times as fast."""
+    """Everything a tick knows of the past: a value as the named tuples are. The fields of `hot` are properties."""
 
-    tick: int
-    # supervisor
-    state: State
-    since: int  # tick of entering the state
-    reaction: Severity  # of SAFE_STOP and FAULT, NONE elsewhere
-    off: bool  # SAFE_STOP has cut the torque and will not give it back
-    in_force: int  # faults
-    good: I64  # (faults,) ticks since each was present
-    counters: Counters
-    clear_until: int  # tick until which latched drive faults are being cleared
-    recovering: bool  # armed outside the joint limits, on request
-    outside: bool  # a joint is beyond its limits
-    leaving: bool  # SIGTERM came
-    done: bool  # nothing more to do: the daemon may leave
+    hot: Record  # (1,) of HOT
+    n: int  # joints
     verdict: str  # why this tick's request was refused, '' when it was not
-    # estimates
-    joints: JointEstimate
-    tip: TipEstimate
-    innovation: float  # normalised, largest of this tick
+    held: tuple[str, ...]  # what holds the arm in words
     model: Model
-    space: OperationalSpace
-    task: Task  # that `space` was evaluated for
-    axis: F64  # (3,) of the tool that goes with it
-    evaluated: bool  # the model, this tick
-    phase: float  # model periods since the last evaluation was due, in (-1, 0]
-    qdd: F64  # (n,) [rad/s2] predicted from the torque of the last command
-    q_previous: F64  # (n,) [rad] of the last feedback
-    age_previous: F64  # (n,) [s] how old it was
-    watch: F64  # (5, n) on the encoders; see `watch`
-    rest: int  # ticks all joints have been at rest
-    # task
-    goal: Goal | None
-    hold: Goal  # where the tip stays without a goal
-    q_rest: F64  # (n,) [rad] posture of the hold
-    v_ref: F64  # (3,) [m/s]
-    w_ref: F64  # (3,) [rad/s]
-    goal_rho: F64  # (K,) [m] from the goal to each obstacle
-    status: Status
-    blocker: int  # obstacle slot or joint index that holds the arm most, -1 for none
-    holders: int  # bits of all that hold it
-    held: tuple[str, ...]  # the same in words
-    escape: Escape
-    still: int  # ticks the tip has been at rest
-    nearest: float  # [s] at full speed: the least that the goal was away
-    idle: float  # [s] for which it has not come nearer; see `goals.idle`
-    # world and torque
-    world: World
-    rho: F64  # (K,) [m] from the arm to each obstacle
-    tau_obstacles: F64  # (n,) [Nm] of the last tick
-    sent: F64  # (4, n) [Nm] the last commands, newest first
-    cut: int  # types.Cut of the last tick
-    pulled: bool  # the last reference for the slew was taken from the echo: the drive does not give what it is sent
-    pace: float  # fraction of qd_max that joints may have
+    parameters: F64  # the model and the task space; see `flat`
+    placed: World  # the obstacles when they were last edited
+    table: F64  # where they are now, and how far from arm and goal; see `flat`
+    shapes: F64  # what does not change of them between edits
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a field of the hot record, as the type that it stands for."""
+        if name.startswith("_") or name not in _NAMES:
+            raise AttributeError(name)
+        value = self.hot[name]
+        if value.ndim == 1:
+            scalar = value.item()
+            return bool(scalar) if name in _FLAGS else _ENUMS[name](scalar) if name in _ENUMS else scalar
+        row = value[0]
+        return row[..., : self.n] if name in _JOINTS or name in ("sent", "watch") else row
+
+    @property
+    def good(self) -> Any:
+        """Return the ticks (faults,) since each fault was present."""
+        return self.hot["good"][0, : len(FAULTS)]
+
+    @property
+    def counters(self) -> Counters:
+        """Return the counters of the detectors."""
+        return Counters(*self.hot["counters"][0].tolist())
+
+    @property
+    def space(self) -> OperationalSpace:
+        """Return the operational space of `task`."""
+        return model_in(self.parameters, self.n, len(self.model.P))[1]
+
+    @property
+    def world(self) -> World:
+        """Return the obstacles as they are now."""
+        t, slots = self.table, len(self.placed.names)
+        p, R = t[: 3 * slots].reshape(slots, 3), t[3 * slots : 12 * slots].reshape(slots, 3, 3)
+        obstacles = self.placed.obstacles._replace(p=p, R=R, margin=row_of(t, MARGIN))
+        return self.placed._replace(obstacles=obstacles, age=row_of(t, AGE))
+
+    @property
+    def rho(self) -> F64:
+        """Return the distances (K,) [m] from the arm to each obstacle."""
+        return row_of(self.table, RHO)
+
+    @property
+    def goal_rho(self) -> F64:
+        """Return the distances (K,) [m] from the goal to each obstacle."""
+        return row_of(self.table, GOAL_RHO)
+
+    @property
+    def joints(self) -> JointEstimate:
+        """Return the state of the joints."""
+        h, n = self.hot[0], self.n
+        return JointEstimate(h["q"][:n], h["qd"][:n], h["P"][:n])
+
+    @property
+    def tip(self) -> TipEstimate:
+        """Return the state of the tip."""
+        h = self.hot[0]
+        return TipEstimate(h["x"], h["xd"], h["P_tip"], h["R"], h["omega"], h["P_rot"])
+
+    @property
+    def goal(self) -> Goal | None:
+        """Return the goal, if there is one."""
+        h = self.hot[0]
+        if not h["has_goal"]:
+            return None
+        return Goal(
+            h["goal"], h["goal_wxyz"], Task(int(h["goal_task"])), float(h["goal_tolerance"]),
+            float(h["goal_tolerance_rot"]), h["goal_axis"], h["goal_posture"][: self.n] if h["has_posture"] else None,
+        )  # fmt: skip
+
+    @property
+    def hold(self) -> Goal:
+        """Return where the tip stays without a goal."""
+        h = self.hot[0]
+        return Goal(
+            h["hold"], h["hold_wxyz"], Task(int(h["hold_task"])), float(h["hold_tolerance"]),
+            float(h["hold_tolerance_rot"]), h["hold_axis"],
+        )  # fmt: skip
+
+    @property
+    def escape(self) -> Escape:
+        """Return the escape."""
+        h = self.hot[0]
+        return Escape(
+            Phase(int(h["escape_phase"])), float(h["escape_hit"]), h["escape_n"], h["escape_b"], h["escape_costs"],
+            int(h["escape_ticks"]), int(h["escape_slow"]),
+        )  # fmt: skip
 
     def _replace(self, **changes: Any) -> "Memory":
         """Return a memory with other values in the fields named, as a named tuple's `_replace` does."""
-        return msgspec.structs.replace(self, **changes)
+        cold = {name: changes.pop(name) for name in _COLD if name in changes}
+        around = {name: changes.pop(name) for name in ("world", "rho", "goal_rho") if name in changes}
+        if around:
+            world = around.get("world", self.world)
+            cold["placed"], cold["shapes"] = world, shapes_of(world.obstacles, world.moving)
+            rho, goal_rho = (around.get(name, getattr(self, name)) for name in ("rho", "goal_rho"))
+            cold["table"] = table_of(world.obstacles, world.age, rho, goal_rho)
+        if changes:
+            hot = copied(cold.get("hot", self.hot))
+            write(hot, changes)
+            cold["hot"] = hot
+        return msgspec.structs.replace(self, **cold)
+
+
+def copied(hot: Record) -> Record:
+    """Return a copy of a hot record: numpy copies a structured array field by field, its bytes in one piece."""
+    out: Record = hot.view(np.uint8).copy().view(HOT)
+    return out
+
+
+def fresh() -> Record:
+    """Return a zeroed hot record."""
+    return np.zeros(1, HOT)
+
+
+def write(hot: Record, changes: dict[str, Any]) -> None:
+    """Write values into a hot record by the names of Memory."""
+    h = hot[0]
+    for name, value in changes.items():
+        if name == "joints":
+            n = len(value.q)
+            h["q"][:n], h["qd"][:n], h["P"][:n] = value
+        elif name == "tip":
+            for key, each in zip(("x", "xd", "P_tip", "R", "omega", "P_rot"), value, strict=True):
+                h[key] = each
+        elif name == "goal":
+            _write_goal(h, value)
+        elif name == "hold":
+            h["hold"], h["hold_wxyz"], h["hold_task"] = value.position, value.wxyz, int(value.task)
+            h["hold_axis"], h["hold_tolerance"], h["hold_tolerance_rot"] = (
+                value.axis, value.tolerance, value.tolerance_rot,
+            )  # fmt: skip
+        elif name == "escape":
+            for key, each in zip(Escape._fields, value, strict=True):
+                h[f"escape_{key}"] = each
+        elif name == "good":
+            h["good"][: len(value)] = value
+        elif name == "counters":
+            h["counters"][:] = value
+        elif np.ndim(value) and name in (*_JOINTS, "sent", "watch"):
+            h[name][..., : np.shape(value)[-1]] = value
+        else:
+            h[name] = value
+
+
+def _write_goal(h: Any, goal: Goal | None) -> None:
+    h["has_goal"] = goal is not None
+    if goal is None:
+        for name in ("goal", "goal_wxyz", "goal_axis", "goal_task", "goal_tolerance", "goal_tolerance_rot"):
+            h[name] = 0
+        h["has_posture"], h["goal_posture"] = 0, 0.0
+        return
+    h["goal"], h["goal_wxyz"], h["goal_axis"] = goal.position, goal.wxyz, goal.axis
+    h["goal_task"], h["goal_tolerance"], h["goal_tolerance_rot"] = int(goal.task), goal.tolerance, goal.tolerance_rot
+    h["has_posture"] = goal.posture is not None
+    h["goal_posture"] = 0.0
+    if goal.posture is not None:
+        h["goal_posture"][: len(goal.posture)] = goal.posture

@@ -22,39 +22,43 @@ class Progress(NamedTuple):
 
 
 @kernel
-def _progress(
-    task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64, xd: F64, omega: F64
-) -> tuple[float, float, float, float]:
+def progress_of(task: int, axis: F64, position: F64, wxyz: F64, x: F64, R: F64, xd: F64, omega: F64) -> Progress:
+    """Return how far the tip at x, R is from a goal and how fast it is, along what the task constrains."""
     e, e_rot = task_error(task, axis, position, wxyz, x, R)
     v, w = selected(task, axis, R, xd, omega)
-    return norm(e), norm(e_rot), norm(v), norm(w)
+    return Progress(norm(e), norm(e_rot), norm(v), norm(w))
 
 
 def progress(goal: Goal, tip: TipEstimate) -> Progress:
     """Return how far the tip is from a goal and how fast it is, along what the goal constrains."""
-    return Progress(*_progress(int(goal.task), goal.axis, goal.position, goal.wxyz, tip.x, tip.R, tip.xd, tip.omega))
+    return progress_of(int(goal.task), goal.axis, goal.position, goal.wxyz, tip.x, tip.R, tip.xd, tip.omega)
 
 
-def arrived(p: Progress, goal: Goal) -> bool:
-    """Return whether the tip rests within the goal's tolerances."""
-    return p.error <= goal.tolerance and p.error_rot <= goal.tolerance_rot and p.speed < 0.05 and p.rate < 0.2
+@kernel
+def arrived(p: Progress, tolerance: float, tolerance_rot: float) -> bool:
+    """Return whether the tip rests within the goal's tolerances [m], [rad]."""
+    return p.error <= tolerance and p.error_rot <= tolerance_rot and p.speed < 0.05 and p.rate < 0.2
 
 
+@kernel
 def at_rest(p: Progress) -> bool:
     """Return whether the tip is still."""
     return p.speed < STILL_SPEED and p.rate < 4.0 * STILL_SPEED
 
 
+@kernel
 def slow(p: Progress) -> bool:
     """Return whether the tip goes nowhere at this speed. How fast it turns says nothing: to the goal is what counts."""
     return p.speed < 4.0 * STILL_SPEED
 
 
+@kernel
 def time_left(p: Progress, v_max: float, w_max: float) -> float:
     """Return the time [s] that the goal is away at full speed [m/s], [rad/s]."""
     return max(p.error / v_max, p.error_rot / w_max)
 
 
+@kernel
 def idle(before: float, p: Progress, left: float, nearest: float, dt: float, window: float) -> float:
     """Return for how long [s] the goal has not come nearer, `before` until a tick of dt [s] ago.
 

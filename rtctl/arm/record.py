@@ -3,15 +3,14 @@
 The ring, the log and the replay all carry these bytes; a field added here appears in all of them.
 """
 
-import struct
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl.arm.estimator import TipEstimate
+from rtctl.kernel import kernel
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, I32, Feedback, Goal, Record
+from rtctl.types import F64, I32, U8, Feedback
 
 
 @cache
@@ -75,49 +74,91 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
     )
 
 
-# the runs of scalars between the arrays
-_HEAD = struct.Struct("<QQdII")  # tick, slot, time, missed, link
-_ASKED = struct.Struct("<Idd")  # verb, lateness, compute
-_ERRORS = struct.Struct("<ddd")  # error, error_rot, sigma_min
-_TAIL = struct.Struct("<IIIIiQIIQI")  # from command on
-_F64, _U32, _I32 = struct.Struct("<d"), np.dtype("<u4"), np.dtype("<i4")
-_TASK = struct.Struct("<I")
+SCALARS = record_dtype(0, 0).itemsize  # bytes of what does not depend on joints and slots
 
 
-class Tail(NamedTuple):
-    """The scalars that end a record, in its order."""
+class Outcome(NamedTuple):
+    """What a record says beside the memory, the feedback and the law."""
 
-    command: int
-    cut: int
-    state: int
-    status: int
-    blocker: int
-    holders: int
-    escape: int
-    severity: int
-    faults: int
-    model_evaluated: bool
+    verb: int  # types.Verb
+    command: int  # types.Drive
+    goal: F64  # (3,) [m]
+    goal_wxyz: F64  # (4,)
+    goal_axis: F64  # (3,)
+    task: int  # types.Task
+    tau_wanted: F64  # (n,) [Nm]
 
 
-def make_record(
-    n: int, slots: int, tick: int, time: float, feedback: Feedback, verb: int, tip: TipEstimate, innovation: float,
-    goal: Goal, F: F64, errors: tuple[float, float, float], seen: F64, nearest: I32, parts: F64, wanted: F64, sent: F64,
-    tail: Tail,
-) -> Record:  # fmt: skip
-    """Return the record of one tick, read-only. All arrays are C-contiguous.
+@kernel
+def _put(out: U8, at: int, raw: U8) -> int:
+    """Write bytes to out from `at` on; return where they end."""
+    for i in range(raw.shape[0]):
+        out[at + i] = raw[i]
+    end: int = at + raw.shape[0]
+    return end
 
-    errors: error [m], error_rot [rad], sigma_min [1/kg]. seen: (4 slots,) rho [m], then force (slots, 3) [N].
-    parts: (5, n) [Nm] from tau_motion to tau_gravity; wanted, sent: (n,) [Nm].
-    Assigning to the fields one by one takes numpy ten times as long as joining their bytes.
+
+@kernel
+def _put_reals(out: U8, at: int, values: F64) -> int:
+    return _put(out, at, values.view(np.uint8))
+
+
+@kernel
+def pack(
+    m: Any, f: Feedback, o: Outcome, errors: tuple[float, float, float], F: F64, torques: F64, seen: F64, nearest: I32,
+    dt: float,
+) -> U8:  # fmt: skip
+    """Return the bytes of the record of one tick.
+
+    m: the memory after it. errors: error [m], error_rot [rad], sigma_min [1/kg]. seen: (4 slots,) rho [m], then force
+    (slots, 3) [N]. torques: (5, n) [Nm] from tau_motion to tau_gravity.
     """
-    f = feedback
-    raw = b"".join((
-        _HEAD.pack(tick, f.slot, time, f.missed, f.link), f.q.tobytes(), f.qd.tobytes(), f.tau.tobytes(),
-        f.age.tobytes(), f.replies.astype(_U32).tobytes(), f.drive.astype(_I32).tobytes(),
-        _ASKED.pack(verb, f.lateness, f.compute),
-        tip.x.tobytes(), tip.xd.tobytes(), quat_of(tip.R).tobytes(), tip.omega.tobytes(), _F64.pack(innovation),
-        goal.position.tobytes(), goal.wxyz.tobytes(), goal.axis.tobytes(), _TASK.pack(goal.task), F.tobytes(),
-        _ERRORS.pack(*errors), seen.tobytes(), nearest.tobytes(), parts.tobytes(), wanted.tobytes(),
-        sent.tobytes(), _TAIL.pack(*tail),
-    ))  # fmt: skip
-    return np.frombuffer(raw, record_dtype(n, slots))
+    n, slots = f.q.shape[0], nearest.shape[0]
+    out = np.empty(SCALARS + 96 * n + 36 * slots, np.uint8)
+    reals, words, longs = np.empty(3), np.empty(4, np.uint32), np.empty(2, np.uint64)
+    longs[0], longs[1] = m.tick, f.slot
+    at = _put(out, 0, longs.view(np.uint8))
+    reals[0] = f.slot * dt
+    at = _put(out, at, reals[:1].view(np.uint8))
+    words[0], words[1] = f.missed, f.link
+    at = _put(out, at, words[:2].view(np.uint8))
+    for values in (f.q, f.qd, f.tau, f.age):
+        at = _put_reals(out, at, values)
+    at = _put(out, at, f.replies.astype(np.uint32).view(np.uint8))
+    at = _put(out, at, f.drive.astype(np.int32).view(np.uint8))
+    words[0] = o.verb
+    at = _put(out, at, words[:1].view(np.uint8))
+    reals[0], reals[1] = f.lateness, f.compute
+    at = _put(out, at, reals[:2].view(np.uint8))
+    at = _put_reals(out, at, m.x.copy())
+    at = _put_reals(out, at, m.xd.copy())
+    at = _put_reals(out, at, quat_of(m.R))
+    at = _put_reals(out, at, m.omega.copy())
+    reals[0] = m.innovation
+    at = _put(out, at, reals[:1].view(np.uint8))
+    for values in (o.goal, o.goal_wxyz, o.goal_axis):
+        at = _put_reals(out, at, values)
+    words[0] = o.task
+    at = _put(out, at, words[:1].view(np.uint8))
+    at = _put_reals(out, at, F)
+    reals[0], reals[1], reals[2] = errors
+    at = _put_reals(out, at, reals)
+    at = _put_reals(out, at, seen)
+    at = _put(out, at, nearest.view(np.uint8))
+    for r in range(torques.shape[0]):
+        at = _put_reals(out, at, torques[r])
+    at = _put_reals(out, at, o.tau_wanted)
+    at = _put_reals(out, at, m.sent[0, :n].copy())
+    words[0], words[1], words[2], words[3] = o.command, m.cut, m.state, m.status
+    at = _put(out, at, words.view(np.uint8))
+    words[0] = np.uint32(m.blocker & 0xFFFFFFFF)
+    at = _put(out, at, words[:1].view(np.uint8))
+    longs[0] = m.holders
+    at = _put(out, at, longs[:1].view(np.uint8))
+    words[0], words[1] = m.escape_phase, m.reaction
+    at = _put(out, at, words[:2].view(np.uint8))
+    longs[0] = m.in_force
+    at = _put(out, at, longs[:1].view(np.uint8))
+    words[0] = m.evaluated
+    _put(out, at, words[:1].view(np.uint8))
+    return out

@@ -11,7 +11,7 @@ from rtctl.arm.model import RigidBody
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
 from rtctl.arm.self_collision import Own
-from rtctl.types import F64, Record, Shape, Task
+from rtctl.types import F64, I64, Record, Shape, Task
 from rtctl.world.meshes import NONE, Meshes
 
 JOINTS_MAX = 15  # of any arm: motor ids have four bits
@@ -71,4 +71,5 @@ class Robot(NamedTuple):
     axes: Task = Task.POSE  # of the tip that the arm can move
     meshes: Meshes = NONE  # that obstacles may refer to
     carry: bool = True  # tip and points are estimated between evaluations; else held still
+    work: tuple[F64, I64] = (np.zeros(0), np.zeros(0, np.int64))  # the memory of `scratch`; see `flat.field_in`
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`

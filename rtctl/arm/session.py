@@ -1,88 +1,21 @@
 """The supervisor's work of one tick: faults in, events out, the state of the session moved by the table."""
 
-import math
-
 import numpy as np
 
-from rtctl.arm import detection, faults, task
+from rtctl.arm import faults, task
 from rtctl.arm.escape import Escape
-from rtctl.arm.faults import BIT, Evidence
+from rtctl.arm.faults import BIT
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
+from rtctl.arm.servo_level import ENABLE_TIMEOUT, REST_HOLD, SETTLE, STOP_TIME
 from rtctl.control import goals, supervisor
 from rtctl.control.supervisor import EVENT_FOR, EVENT_OF, Event
 from rtctl.kernel import reductions
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, Cut, Feedback, Goal, Request, Severity, State, Status, Task, Verb
+from rtctl.types import F64, Feedback, Goal, Request, Severity, State, Status, Task, Verb
 from rtctl.world import obstacle_table
 
-SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque builds up at its rate limit
-ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
 CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
-REST_SPEED = 0.03  # [rad/s] a joint slower than this rests (encoders of MIT drives resolve 0.005)
-REST_HOLD = 0.1  # [s] at rest before the drives are disabled
-STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushing, brakes do the rest
-NON_FINITE = int(Cut.NON_FINITE)  # a plain integer: a flag's & is slow
-
-
-def drives_torque(m: Memory) -> bool:
-    """Return whether the state wants torque from the drives."""
-    if m.state == State.SAFE_STOP:
-        return not m.off
-    return m.state in (State.ARMED, State.RUN, State.STOPPING)
-
-
-def believed(robot: Robot, m: Memory, feedback: Feedback) -> tuple[Feedback, bool]:
-    """Return the feedback with silence in place of positions that no joint can have reached, and whether any is.
-
-    A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump.
-    """
-    if not drives_torque(m) or m.state == State.ARMED:
-        return feedback, False
-    elapsed = robot.dt * (1 + feedback.missed)
-    args = (feedback.q, feedback.age, feedback.replies, m.q_previous, m.age_previous, robot.qd_max, elapsed, robot.dt)
-    if not faults.any_jumped(*args):
-        return feedback, False
-    odd = faults.jumped(*args)
-    silent = np.minimum(m.age_previous + elapsed, robot.safety.lost_periods * robot.dt)
-    return feedback._replace(
-        q=np.where(odd, m.q_previous, feedback.q),
-        age=np.where(odd, silent, feedback.age),
-        replies=np.where(odd, 0, feedback.replies),
-    ), True
-
-
-def detected(robot: Robot, m: Memory, feedback: Feedback, jumped: bool) -> tuple[Memory, int]:
-    """Return the memory with the faults in force, and the bits of those present now; what jumped is in no feedback."""
-    f, safety = feedback, robot.safety
-    powered = drives_torque(m)
-    active = powered and m.state != State.ARMED
-    watch, age, feed_age, seen = detection.notice(
-        m.watch, active, f.q, f.qd, f.tau, f.age, f.replies, f.drive, m.sent, m.q_previous, m.age_previous, m.qdd,
-        m.model.A, m.rho, m.goal_rho, m.world.age, m.world.moving, safety.torque_tolerance, safety.friction,
-        safety.velocity_tolerance, safety.limit_tolerance, safety.speed_tolerance, REST_SPEED, robot.q_min, robot.q_max,
-        robot.qd_max, robot.dt * (1 + f.missed), robot.dt,
-    )  # fmt: skip
-    lost = bool(m.cut & NON_FINITE) or not math.isfinite(m.innovation)
-    evidence = Evidence(
-        seen, age, feed_age, f.missed, active, powered, jumped, m.pulled, m.recovering, lost, m.goal is not None,
-        m.innovation,
-    )  # fmt: skip
-    present, counters = faults.detect(f.link, evidence, m.counters, safety, robot.dt)
-    in_force, good = faults.latch(present, m.in_force, m.good)
-    outside = bool(seen & detection.BEYOND)
-    m = m._replace(
-        counters=counters,
-        in_force=in_force,
-        good=good,
-        q_previous=feedback.q,
-        age_previous=feedback.age,
-        outside=outside,
-        recovering=m.recovering and outside,
-        watch=watch,
-        rest=0 if seen & detection.STIRS else m.rest + 1,
-    )
-    return m, present
 
 
 def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:

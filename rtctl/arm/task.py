@@ -139,6 +139,16 @@ def point_of(goal: Goal, free: F64) -> F64:
     return np.array([goal.position[i] if bits >> i & 1 else free[i] for i in range(3)])
 
 
+@kernel
+def point_along(task: int, position: F64, free: F64) -> F64:
+    """Return `point_of` a goal's position (3,) [m] under a task."""
+    out = position.copy()
+    for i in range(3):
+        if not task >> i & 1:
+            out[i] = free[i]
+    return out
+
+
 def wholly_placed(goal: Goal) -> bool:
     """Return whether the goal constrains all three coordinates of the tip."""
     return int(goal.task) & _POSITION == _POSITION

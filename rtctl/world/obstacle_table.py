@@ -138,12 +138,13 @@ def _cleared(world: World, slot: int) -> World:
 
 
 def _with_margins(world: World) -> World:
-    margin = _margins(world.obstacles.margin, world.age, world.moving, world.creep, world.stale, 0.0)
+    margin = margins(world.obstacles.margin, world.age, world.moving, world.creep, world.stale, 0.0)
     return world._replace(obstacles=world.obstacles._replace(margin=margin))
 
 
 @kernel
-def _margins(margin: F64, age: F64, moving: B1, creep: float, stale: float, dt: float) -> F64:
+def margins(margin: F64, age: F64, moving: B1, creep: float, stale: float, dt: float) -> F64:
+    """Return the margins (K,) [m] of observations of these ages, dt [s] after the margins given."""
     out = np.zeros_like(margin)
     for k in range(margin.shape[0]):
         if moving[k]:
@@ -168,7 +169,7 @@ def _advanced(
     for k in range(age.shape[0]):
         if moving[k]:
             older[k] += dt
-    return p, R, older, _margins(obstacles.margin, older, moving, creep, stale, dt)
+    return p, R, older, margins(obstacles.margin, older, moving, creep, stale, dt)
 
 
 def distance_from(world: World, x: F64) -> F64:
@@ -176,11 +177,12 @@ def distance_from(world: World, x: F64) -> F64:
 
     To where it was seen to be and moves, without the margin of its age.
     """
-    return _distance_from(x, world.obstacles)
+    return distances_from(world.obstacles, x)
 
 
 @kernel
-def _distance_from(x: F64, obstacles: Obstacles) -> F64:
+def distances_from(obstacles: Obstacles, x: F64) -> F64:
+    """Return `distance_from` of a point x (3,) [m]."""
     slots = obstacles.active.shape[0]
     out = np.empty((slots, 4, 1))
     distances_into(x.copy().reshape(3, 1), np.zeros(1), obstacles, math.inf, out)

@@ -13,11 +13,15 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
-from rtctl.arm.memory import Memory
+from rtctl.arm.escape import DIRECTIONS, Phase
+from rtctl.arm.flat import shapes_of
+from rtctl.arm.memory import HOT, Memory
 from rtctl.arm.robot import Robot
+from rtctl.types import Severity, State, Status, Task
 from rtctl.world.primitives import MESH
 
 PERIOD = 5.0  # [s] of robot time between two
+_HOT = "hot"  # stands for the type of the memory's record
 
 
 class Checkpoint(NamedTuple):
@@ -34,7 +38,7 @@ def due(tick: int, dt: float) -> bool:
 
 def encode_checkpoint(memory: Memory, counters: tuple[int, ...]) -> bytes | None:
     """Return the JSON of a checkpoint; None while a cloud is among the obstacles: its tree is not worth its bytes."""
-    if any(len(cloud) for cloud in memory.world.obstacles.clouds):
+    if any(len(cloud) for cloud in memory.placed.obstacles.clouds):
         return None
     blobs: list[bytes] = []
     fields = [_plain(getattr(memory, name), blobs) for name in memory.__struct_fields__]
@@ -70,6 +74,7 @@ def layout() -> str:
 
 def _layouts() -> Iterator[tuple[str, tuple[str, ...]]]:
     yield "Memory", Memory.__struct_fields__
+    yield _HOT, tuple(f"{name} {HOT[name].base.str}{HOT[name].shape}" for name in HOT.names or ())
     for name, kind in sorted(_kinds().items()):
         yield name, kind._fields
 
@@ -92,7 +97,7 @@ def _plain(value: Any, blobs: list[bytes]) -> Any:
     """Return a value as JSON knows it; arrays are appended to blobs."""
     if isinstance(value, np.ndarray):
         blobs.append(value.tobytes())
-        return {"a": value.dtype.str, "s": value.shape}
+        return {"a": _HOT if value.dtype == HOT else value.dtype.str, "s": value.shape}
     if isinstance(value, tuple):
         left_out = {"World": "known", "Obstacles": "mesh"}.get(type(value).__name__, "")
         nodes = [None if name == left_out else _plain(each, blobs) for name, each in _named(value)]
@@ -126,7 +131,7 @@ class _Raw:
 
 def _value(node: Any, hint: Any, raw: _Raw) -> Any:
     if isinstance(node, dict) and "a" in node:
-        return raw.take(np.dtype(node["a"]), tuple(node["s"]))
+        return raw.take(HOT if node["a"] == _HOT else np.dtype(node["a"]), tuple(node["s"]))
     if isinstance(node, dict) and "n" in node:
         kind = _kinds()[node["n"]]
         hints = get_type_hints(kind)
@@ -139,26 +144,33 @@ def _value(node: Any, hint: Any, raw: _Raw) -> Any:
 
 
 def _with_meshes(memory: Memory, robot: Robot) -> Memory:
-    obstacles = memory.world.obstacles._replace(mesh=robot.meshes.data)
+    obstacles = memory.placed.obstacles._replace(mesh=robot.meshes.data)
     bodies = [robot.meshes.start(name) for name in robot.meshes.names]
     meshes = obstacles.dims[obstacles.kind == MESH]
     if not np.isin(meshes[:, 3], bodies).all() or not ((obstacles.group >= 0) & (obstacles.group < robot.slots)).all():
         raise ValueError("not a checkpoint of this robot: obstacles")
-    return memory._replace(world=memory.world._replace(known=robot.meshes, obstacles=obstacles))
+    placed = memory.placed._replace(known=robot.meshes, obstacles=obstacles)
+    return memory._replace(placed=placed, shapes=shapes_of(obstacles, placed.moving))
 
 
 def _check(memory: Memory, template: Memory) -> None:
     """Raise ValueError where a field could not stand in the template's place."""
     for name in Memory.__struct_fields__:
-        if name not in ("goal", "held"):
+        if name != "held":
             _like(getattr(memory, name), getattr(template, name), name)
-    if not all(isinstance(text, str) for text in memory.held):
+    if memory.n != template.n:
+        raise ValueError("not a checkpoint of this robot: joints")
+    if not isinstance(memory.held, tuple) or not all(isinstance(text, str) for text in memory.held):
         raise ValueError("not a checkpoint: held")
-    if memory.goal is not None:
-        n = len(template.q_rest)
-        if memory.goal.posture is not None and np.shape(memory.goal.posture) != (n,):
-            raise ValueError("not a checkpoint of this robot: goal.posture")
-        _like(memory.goal._replace(posture=None), template.hold, "goal")
+    h = memory.hot[0]
+    kinds = {
+        "state": State, "reaction": Severity, "status": Status, "task": Task, "goal_task": Task, "hold_task": Task,
+        "escape_phase": Phase,
+    }  # fmt: skip
+    for name, kind in kinds.items():
+        kind(int(h[name]))  # raises ValueError
+    if not h["escape_ticks"] >= 0 or (h["escape_phase"] == Phase.CHOOSING and h["escape_ticks"] >= DIRECTIONS):
+        raise ValueError("not a checkpoint: escape")
 
 
 def _like(value: Any, wanted: Any, place: str) -> None:
