@@ -96,7 +96,6 @@ def test_a_demo_that_reaches_its_goals_says_so_and_exits_with_success(good: Run)
         r"faults +none",
         r"exit codes +controller 0, drives 0",
         r"PASS  2 of 2 goals reached, 0 contacts",
-        r"mode +lockstep",
     ):
         assert re.search(rf"(?m)^{line}\s*$", good.text), line
     lines = good.text.strip().split("\n")

@@ -12,6 +12,7 @@ LOCKSTEP: time goes on when the drives have been answered, and there are no dead
 
 import argparse
 import os
+import re
 import sys
 import tempfile
 import time
@@ -195,7 +196,7 @@ def _attempt(
             voice("dim", line)
         played = play(pair.console, scenario, voice, pair.lines, deadlines=not lockstep)
     for line in pair.lines():
-        voice("dim", line)
+        voice("dim", re.sub(r" \d+ slots missed,", "", line) if lockstep else line)
     if not pair.report():
         raise DemoError(f"the drives left no report: {pair.exits}")
     log = played.log.removesuffix(".open")
