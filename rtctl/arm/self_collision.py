@@ -50,6 +50,12 @@ class Own:
         """Return the pairs (k,) that are not proven to be farther apart than `reach`; arguments as in `measure`."""
         return _near(self.pairs, self._hulls, self.reach + SLACK, Rj, tj)
 
+    def meet(self, Rj: F64, tj: F64, met: B1) -> None:
+        """Set in met (L,) what is nearer than `reach`; what is set already is not measured again."""
+        for s in self.near(Rj, tj):
+            if not met[s]:
+                met[s] = self._exact(s, Rj, tj) < self.reach
+
     def distances(self, Rj: F64, tj: F64) -> F64:
         """Return rho (L,) [m] as `measure` does."""
         rho = np.full(len(self.pairs), np.inf)

@@ -53,8 +53,7 @@ def watched(body: RigidBody, q_min: F64, q_max: F64, q_home: F64, influence: flo
     samples = np.random.default_rng(0).uniform(q_min, q_max, (POSTURES, body.n))
     meets = np.zeros(len(pairs), np.bool_)
     for q in samples:
-        open_ = np.flatnonzero(~meets)  # what has met once need not be measured again
-        meets[open_] = body.own_distances(q, Own(hulls, every.pairs[open_], SAFE)) < SAFE
+        every.meet(*body.placements(q), meets)
     at_home = body.own_distances(q_home, home)
     elbow = np.array([body.parent[body.parent[hulls[i].link]] == hulls[j].link for i, j in pairs])
     keep = meets & ~(at_home < influence) & ~(elbow & (at_home < CROOK))

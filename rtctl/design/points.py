@@ -111,18 +111,44 @@ def _need2(centres: F64, samples: F64, triangles: I64) -> F64:
 
 
 @kernel
+def _holds(centres: F64, radii: F64, samples: F64, triangles: I64) -> B1:
+    """Return whether (k, t) the ball about each centre holds each triangle's corners; radii (k,) [m]."""
+    holds = np.empty((centres.shape[0], triangles.shape[0]), np.bool_)
+    d2 = np.empty(samples.shape[0])
+    for k in range(centres.shape[0]):
+        for s in range(samples.shape[0]):
+            x, y, z = samples[s, 0] - centres[k, 0], samples[s, 1] - centres[k, 1], samples[s, 2] - centres[k, 2]
+            d2[s] = x * x + y * y + z * z
+        most = radii[k] * radii[k]
+        for t in range(triangles.shape[0]):
+            holds[k, t] = max(d2[triangles[t, 0]], d2[triangles[t, 1]], d2[triangles[t, 2]]) <= most
+    return holds
+
+
+@kernel
 def _greedy(covers: B1, weight: I64, open_: B1) -> I64:
-    """Return the rows that cover what is open, the largest weight first; what no row covers stays open."""
+    """Return the rows that cover what is open, the largest weight first; what no row covers stays open.
+
+    A row's gain is an upper bound of what it gains later, when less is open: only rows that may be the best are summed
+    anew. Of equal gains the first row is taken.
+    """
     chosen: list[int] = []
+    gains = np.zeros(covers.shape[0], np.int64)
+    for k in range(covers.shape[0]):
+        for t in range(covers.shape[1]):
+            if covers[k, t] and open_[t]:
+                gains[k] += weight[t]
     while True:
         best, best_gain = -1, 0
         for k in range(covers.shape[0]):
-            gain = 0
-            for t in range(covers.shape[1]):
-                if covers[k, t] and open_[t]:
-                    gain += weight[t]
-            if gain > best_gain:
-                best, best_gain = k, gain
+            if gains[k] > best_gain:
+                gain = 0
+                for t in range(covers.shape[1]):
+                    if covers[k, t] and open_[t]:
+                        gain += weight[t]
+                gains[k] = gain
+                if gain > best_gain:
+                    best, best_gain = k, gain
         if best < 0:
             return np.array(chosen, dtype=np.int64)
         chosen.append(best)
@@ -137,13 +163,13 @@ def _cover(pieces: list[Solid], overhang: float) -> tuple[F64, F64]:
     reach = np.max([depth(s, grid) for s in pieces], axis=0) + overhang
     samples, triangles = _outer_surface(pieces, min(EDGE, 0.6 * overhang))
     weight = np.ceil(areas(samples, triangles) * 1e9).astype(np.int64)  # integers: sums do not depend on order
-    covers = _need2(grid, samples, triangles) <= (reach[:, None] - STEP) ** 2
+    covers = _holds(grid, reach - STEP, samples, triangles)
     open_: B1 = np.ones(len(triangles), dtype=np.bool_)
     chosen = _greedy(covers, weight, open_)
     chosen = _needed(covers, chosen, ~open_)
     # Sharp edges between grid points are left: a ball about a triangle always holds it.
     rest = np.round(samples[triangles[open_]].mean(axis=1) / STEP) * STEP
-    covers = _need2(rest, samples, triangles) <= (overhang - STEP) ** 2
+    covers = _holds(rest, np.full(len(rest), overhang - STEP), samples, triangles)
     rest = rest[_greedy(covers, weight, open_)]
     centres = np.concatenate([grid[chosen], rest])
     return centres, _shrunk(centres, np.append(reach[chosen], np.full(len(rest), overhang)), samples, triangles)
