@@ -218,7 +218,7 @@ class View:
     def _version(self, m: Any, now: float) -> None:
         v = int(m.flight_sw_version)
         firmware = (v >> 24 & 0xFF, v >> 16 & 0xFF, v >> 8 & 0xFF)
-        if firmware != self.firmware:
+        if firmware != self.firmware and v:  # 0: it does not say
             self.firmware = firmware
             self.say(f"firmware {'.'.join(map(str, firmware))}" + _implied(self.autopilot, firmware))
 
