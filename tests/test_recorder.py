@@ -310,10 +310,17 @@ def test_segments_follow_one_another_and_their_numbers_go_on(tmp_path: Path) -> 
     assert read(files[0]).sentinel["next"] == files[1].name
 
 
+def segment_of(folder: Path, session: str, number: int = 0) -> Path:
+    """Leave a closed segment as a recorder does."""
+    written = Session(HEADER, Options(folder, session), first=number)
+    written.write(events(3))
+    written.close({"reason": "closed"}, 3)
+    return written.path
+
+
 def test_the_disk_floor_is_kept_by_deleting_the_oldest_unpinned_logs(tmp_path: Path) -> None:
-    for k, name in enumerate(("old.000.mcap", "pinned.000.mcap", "newer.000.mcap")):
-        (tmp_path / name).write_bytes(b"x")
-        os.utime(tmp_path / name, (k, k))
+    for name in ("old", "pinned", "newer"):
+        segment_of(tmp_path, name)
     (tmp_path / "pinned.000.mcap.pin").touch()
     free = iter([5, 20])
     session = Session(HEADER, options(tmp_path, floor_bytes=10), free=lambda folder: next(free))

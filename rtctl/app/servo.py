@@ -14,6 +14,7 @@ from rtctl.arm.robot import Robot
 from rtctl.hal.can.link import CanLink
 from rtctl.hal.clock import Slot
 from rtctl.log.record import checkpoint
+from rtctl.log.record.health import Repeats
 from rtctl.log.record.requests import encode_event, encode_request
 from rtctl.types import Command, Drive, Feedback, Frames, Record, Request, Status, Task
 
@@ -85,6 +86,7 @@ class Servo:
         self.now = 0.0  # [s] robot time of the last slot
         self.faults_seen = 0
         self.compute = 0.0  # [s] of the previous turn
+        self.repeats = Repeats()
         self.events: list[tuple[float, str, str]] = []  # newest last; (time [s], name, detail)
         self.lateness = 0.0  # [s] of this wake-up
         self.flags = 0  # types.Link bits that only the daemon knows
@@ -104,7 +106,7 @@ class Servo:
         self.lateness = slot.lateness
         self.faults_seen |= self.memory.in_force
         self.now = now = slot.slot * self.robot.dt
-        news = self.machine.news(self.robot, before, self.memory, feedback)
+        news = self.repeats.passed(now, self.machine.news(self.robot, before, self.memory, feedback))
         self.events += [(now, name, detail) for name, detail in news]
         self._log(feedback, record, frames, request, now, news)
         self.compute = time.perf_counter() - begin

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rtctl.cli import pictures, replays
-from rtctl.cli.parser import Commands, command, positive
+from rtctl.cli.parser import Commands, command, log_file, positive
 from rtctl.cli.progress import bar
 from rtctl.cli.values import table
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         _recover,
     )
     recover.description = RECOVER_TEXT
-    recover.add_argument("path", metavar="FILE|FOLDER")
+    recover.add_argument("path", metavar="FILE|FOLDER", type=log_file)
     recover.add_argument(
         "--out", metavar="FILE", default="", help="write the whole log there; default: in place for .open"
     )
@@ -54,7 +54,9 @@ def add(commands: Commands) -> None:
     tail = command(
         actions, "tail", "follow a log while it is written", "rtctl log tail\n  rtctl log tail logs/ --json", _tail
     )
-    tail.add_argument("path", metavar="FILE|FOLDER", nargs="?", default="logs", help="default: the newest in logs/")
+    tail.add_argument(
+        "path", metavar="FILE|FOLDER", type=log_file, nargs="?", default="logs", help="default: the newest in logs/"
+    )
     tail.add_argument("--json", action="store_true", help="print a JSON object a line")
     tail.add_argument("--every", metavar="S", type=positive, default=1.0, help="between two states (%(default)s s)")
     tail.add_argument("--for", dest="seconds", metavar="S", type=positive, default=float("inf"), help="then stop")
@@ -65,12 +67,13 @@ def add(commands: Commands) -> None:
 RECOVER_EXAMPLE = "rtctl log recover logs/\n  rtctl log recover cut.mcap --out whole.mcap"
 RECOVER_TEXT = """Make logs whole that a crash cut off, and empty the rings it left in /dev/shm.
 
-A .open file is closed in place, any other damaged file is copied first. The result is opened again and counted by
-another reader before it is believed. Exit code 0: nothing was lost; 3: whole, but something was lost; 1: failed."""
+A file is copied under a temporary name, opened again and counted by another reader before it is believed. Only then
+does the copy replace a .open file, or stand beside any other.
+Exit code 0: nothing was lost; 3: whole, but something was lost; 1: failed."""
 
 
 def _file(parser: Any) -> None:
-    parser.add_argument("file", metavar="FILE")
+    parser.add_argument("file", metavar="FILE", type=log_file)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -92,13 +95,15 @@ def _text(found: dict[str, Any]) -> str:
         ("dropouts", f"{found['dropouts']['entries']} entries, {found['damaged_chunks']} damaged chunks"),
         ("versions", ", ".join(f"{name} {version}" for name, version in found.get("versions", {}).items()) or "-"),
     ]
+    if found["beyond_2_63_ns"]:
+        head.append(("times", "reach beyond 2^63 ns, the year 2262: those read as 2^63 - 1"))
     lines = [f"{name:9} {text}" for name, text in head]
     rows = [[n, str(t["messages"]), f"{t['hz']:.1f}", str(t["holes"]), t["schema"]] for n, t in found["topics"].items()]
     return "\n".join([*lines, "", table(rows, ["topic", "messages", "Hz", "holes", "schema"], frozenset((1, 2, 3)))])
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from rtctl.log.mcap.examine import examine
+    from rtctl.log.read.examine import examine
 
     path = Path(arguments.file)
     with bar("examining", path.stat().st_size if path.is_file() else 1) as progress:
@@ -112,7 +117,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    from rtctl.log.mcap.examine import mend, open_files
+    from rtctl.log.read.mend import mend, open_files
     from rtctl.log.record.recorder import rescue
 
     path = Path(arguments.path)
@@ -130,7 +135,8 @@ def _recover(arguments: argparse.Namespace) -> int:
     else:
         for m in done:
             lost = f"{m.lost_bytes} bytes and {m.damaged} chunks lost" if m.code else "nothing lost"
-            print(f"{m.path}: {m.messages} messages, {lost}; another reader finds {m.independent}, with the sentinel")
+            more = ", with the sentinel" if m.independent > m.messages else ""
+            print(f"{m.path}: {m.messages} messages, {lost}; another reader finds {m.independent}{more}")
         for p in rescued:
             print(f"{p}: out of the ring that a crash left")
         if not done and not rescued:

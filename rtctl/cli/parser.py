@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import re
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -63,6 +64,16 @@ def number(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"got {text!r}, wanted a finite number")
     return value
+
+
+def log_file(text: str) -> str:
+    """Return the name of a log file or folder. Raises UsageError for one that cannot be said in a message or a page."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        name = os.fsencode(text).decode("utf-8", "backslashreplace")
+        raise UsageError(f"{name}: its name is not UTF-8; rename it first") from None
+    return text
 
 
 def positive(text: str) -> float:

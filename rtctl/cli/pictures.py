@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rtctl.cli.parser import Commands, command, number
+from rtctl.cli.parser import Commands, command, log_file, number
 from rtctl.cli.progress import bar
 from rtctl.errors import EXIT_OK, UsageError
 
@@ -24,7 +24,7 @@ def add(actions: Commands) -> None:
     """Add the three commands."""
     export = command(actions, "export", "write a log in another program's format", EXPORT_EXAMPLE, _export)
     export.description = EXPORT_TEXT
-    export.add_argument("file", metavar="FILE")
+    export.add_argument("file", metavar="FILE", type=log_file)
     export.add_argument("--out", metavar="FILE", default="-", help="default: standard output, for csv and candump")
     export.add_argument("--format", choices=FORMATS, default="", help="default: by the ending of --out, else csv")
     export.add_argument("--topic", metavar="TOPIC", default="/tick", help="for csv and parquet; default: %(default)s")
@@ -34,7 +34,7 @@ def add(actions: Commands) -> None:
         "rtctl log plot run.mcap --fields x,error,tau_sent --from 2 --to 4 --out run.png\n"
         "  rtctl log plot run.mcap --list", _plot,
     )  # fmt: skip
-    plot.add_argument("file", metavar="FILE")
+    plot.add_argument("file", metavar="FILE", type=log_file)
     plot.add_argument("--fields", metavar="A,B,…", default="x,error,rho,tau_sent", help="default: %(default)s")
     plot.add_argument("--from", dest="start", metavar="S", type=number, default=0.0, help="after the log's begin")
     plot.add_argument("--to", dest="stop", metavar="S", type=number, default=1e12, help="after the log's begin")
@@ -44,7 +44,7 @@ def add(actions: Commands) -> None:
         actions, "report", "write one HTML page about a log that needs no network",
         "rtctl log report run.mcap\n  rtctl log report run.mcap --out run.html --png run.png", _report,
     )  # fmt: skip
-    report.add_argument("file", metavar="FILE")
+    report.add_argument("file", metavar="FILE", type=log_file)
     report.add_argument("--out", metavar="FILE", default="", help="default: beside the log, .html")
     report.add_argument("--png", metavar="PICTURE", default="", help="also draw its main plots into one picture")
 

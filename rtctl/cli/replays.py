@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rtctl.cli.parser import Commands, command
+from rtctl.cli.parser import Commands, command, log_file
 from rtctl.cli.progress import bar
 from rtctl.errors import EXIT_FAILED, EXIT_OK
 
@@ -22,7 +22,7 @@ def add(actions: Commands) -> None:
         actions, "replay", "run the controller again on a log: the same bits, or where not", REPLAY_EXAMPLE, _replay
     )
     replay.description = REPLAY_TEXT
-    replay.add_argument("file", metavar="FILE")
+    replay.add_argument("file", metavar="FILE", type=log_file)
     replay.add_argument("--config", metavar="CONFIG", default="", help="what if: the commands of this config instead")
     replay.add_argument(
         "--plot", metavar="PICTURE", default="", help="draw both torques and their difference (png, svg)"
@@ -34,8 +34,8 @@ def add(actions: Commands) -> None:
     diff.description = (
         "Two runs side by side: what each did, which fields differ, since when, by how much. Exit code 1 if any does."
     )
-    diff.add_argument("a", metavar="A")
-    diff.add_argument("b", metavar="B")
+    diff.add_argument("a", metavar="A", type=log_file)
+    diff.add_argument("b", metavar="B", type=log_file)
     diff.add_argument("--plot", metavar="PICTURE", default="", help="draw tip, error and torque of both (png, svg)")
     diff.add_argument("--json", action="store_true", help="print one JSON object")
 

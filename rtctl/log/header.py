@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from rtctl.arm.record import record_dtype
+from rtctl.log import limits
 from rtctl.types import Shape
 from rtctl.world.meshes import NONE, Meshes, added
 
@@ -153,6 +154,8 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
         dtype = np.dtype(fields)
     except SyntaxError as error:  # numpy evaluates what stands between commas
         raise ValueError(f"no format of numpy: {error}") from None
+    if dtype.itemsize > limits.TICK:
+        raise ValueError(f"a record of {dtype.itemsize} bytes, at most {limits.TICK} are read")
     if unknown := {f.base.str for f in (dtype[name] for name in dtype.names or ())} - FIXED:
         raise ValueError(f"types {sorted(unknown)}, wanted some of {sorted(FIXED)}")
     return dtype
@@ -183,12 +186,17 @@ def header_from_json(text: str) -> Header:
     Raises ValueError, TypeError or KeyError on anything else.
     """
     raw = json.loads(text)
+    slots, period = int(raw["slots"]), float(raw["period"])
+    if not 0 <= slots <= limits.SLOTS or not 0.0 < period <= limits.PERIOD:
+        raise ValueError(
+            f"{slots} slots and a period of {period} s, wanted at most {limits.SLOTS} and {limits.PERIOD:g} s"
+        )
     return Header(
         robot=str(raw["robot"]),
-        joints=tuple(map(str, raw["joints"])),
-        slots=int(raw["slots"]),
-        period=float(raw["period"]),
-        buses=tuple(map(str, raw["buses"])),
+        joints=_names(raw["joints"]),
+        slots=slots,
+        period=period,
+        buses=_names(raw["buses"]),
         config=str(raw["config"]),
         urdf=str(raw["urdf"]),
         dtype=dtype_from_json(raw["dtype"]),
@@ -196,5 +204,11 @@ def header_from_json(text: str) -> Header:
         revision=str(raw["revision"]),
         extra={str(k): str(v) for k, v in raw["extra"].items()},
         files={str(k): _from_text(v) for k, v in raw["files"].items()},
-        links=tuple(map(str, raw.get("links", ()))),
+        links=_names(raw.get("links", ())),
     )
+
+
+def _names(values: list[str]) -> tuple[str, ...]:
+    if not isinstance(values, list | tuple) or len(values) > limits.NAMES:
+        raise ValueError(f"wanted a list of at most {limits.NAMES} names")
+    return tuple(map(str, values))

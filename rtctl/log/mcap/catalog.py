@@ -1,23 +1,31 @@
 """What is where in a log file: from its summary when it is whole, by walking it when it is not."""
 
-import io
 import json
 import struct
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from rtctl.log.mcap.summary import END
-from rtctl.log.mcap.walk import I64_MAX, RECORD, Damaged, Source, chunk_head, has_magic, message_index, rows_of, walk
+from rtctl.log.mcap.walk import (
+    I64_MAX,
+    RECORD,
+    Damaged,
+    Source,
+    chunk_head,
+    has_magic,
+    message_index,
+    parsed,
+    rows_of,
+    walk,
+)
 from rtctl.types import I64, U64
 
-T = TypeVar("T")
 FOOTER_SIZE = RECORD.size + 20 + 8
+U64_MAX = (1 << 64) - 1
 LOOKED_AT = 8  # chunks of a summary whose own records are compared with it
 _CHUNK_INDEX = int(Opcode.CHUNK_INDEX)  # an Opcode takes ten times as long to compare
 _INDEX_HEAD = np.dtype([("start", "<u8"), ("end", "<u8"), ("at", "<u8"), ("length", "<u8"), ("table", "<u4")])
@@ -75,17 +83,6 @@ def _chunks(
     place, time = np.array(places, np.int64).reshape(-1, 2), np.array(times, np.uint64).reshape(-1, 2)
     index = np.array(indices, np.int64).reshape(-1, 3)
     return Chunks(*place.T, *time.T, *index.T)
-
-
-def parsed(read: Callable[[ReadDataStream], T], data: Source, body: int, end: int) -> T:
-    """Return the record whose body is [body, end).
-
-    Raises Damaged.
-    """
-    try:
-        return read(ReadDataStream(io.BytesIO(data[body:end])))
-    except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
-        raise Damaged(f"record at {body}: {error}") from None
 
 
 def catalog(data: Source) -> Catalog:
@@ -200,8 +197,10 @@ def _from_walk(data: Source) -> Catalog:
                 _metadata(found, data, body, end)
             else:
                 _describe(found, data, opcode, body, end)
-        except Damaged:
-            break
+        except Damaged:  # it is known where the next one begins
+            if opcode == Opcode.CHUNK:  # counted as one that cannot be read, wherever somebody looks
+                places.append((body, end))
+                times.append((0, U64_MAX))
         good = end
     if not complete:  # the cut may have gone through the last chunk's indices: that one is walked
         indices = [index for index in indices if index[0] != len(places) - 1]
@@ -235,9 +234,10 @@ def describe_chunk(found: Catalog, records_of_chunk: bytes) -> None:
             _describe(found, records_of_chunk, opcode, body, end)
 
 
-def attachment(data: Source, place: tuple[int, int]) -> Any:
+def attachment(data: Source, place: tuple[int, int]) -> records.Attachment:
     """Return the attachment record at a place.
 
     Raises Damaged.
     """
-    return parsed(records.Attachment.read, data, *place)
+    found: records.Attachment = parsed(records.Attachment.read, data, *place)
+    return found

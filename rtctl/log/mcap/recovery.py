@@ -12,11 +12,13 @@ from mcap.opcode import Opcode
 
 from rtctl.errors import LogError
 from rtctl.log import schema
-from rtctl.log.mcap.catalog import attachment, parsed
+from rtctl.log.mcap.catalog import attachment, catalog
+from rtctl.log.mcap.names import OPEN, logs_in
 from rtctl.log.mcap.rows import Encoded, message
-from rtctl.log.mcap.segment import OPEN, Segment, locked, settle
+from rtctl.log.mcap.segment import Segment, locked, settle
 from rtctl.log.mcap.summary import END, Summary, message_indices
 from rtctl.log.mcap.walk import (
+    I64_MAX,
     MESSAGE,
     RECORD,
     Damaged,
@@ -25,6 +27,7 @@ from rtctl.log.mcap.walk import (
     chunk_messages,
     has_magic,
     message_index,
+    parsed,
     walk,
 )
 
@@ -80,12 +83,35 @@ def recover(path: Path, content: Mapping[str, Any] | None = None) -> Recovery:
         os.ftruncate(file, scan.good)
         os.lseek(file, scan.good, os.SEEK_SET)
         segment.write(scan.indices)
-        segment.add(_sentinel(scan.summary, {**(content or {"reason": "cut off"}), "lost_bytes": lost}))
-        segment.finish()
-    except OSError:
+        segment.add(sentinel(scan.summary, {**(content or {"reason": "cut off"}), "lost_bytes": lost}))
+        segment.end()
+        _verified(path)
+    except (OSError, LogError):
         segment.close()
         raise
+    settle(path, target)
+    segment.close()
     return Recovery(target, kept, lost, scan.damaged, scan.entries)
+
+
+def _verified(path: Path) -> None:
+    """Raise LogError unless a file is read as one that its writer has closed."""
+    data = path.read_bytes()
+    try:
+        complete = catalog(data).complete
+    except Damaged as error:
+        raise LogError(f"{path}: {error}") from None
+    if not complete:
+        raise LogError(f"{path}: is not whole after recovery")
+
+
+def entries_of(path: Path) -> int:
+    """Return the number of the last ring entry in a closed file; 0 when it does not say, or cannot be read."""
+    try:
+        data = path.read_bytes()
+        return _scan(data).entries if has_magic(data, len(data))[0] else 0
+    except OSError:
+        return 0
 
 
 def drop_last_chunk(path: Path) -> bool:
@@ -100,13 +126,14 @@ def drop_last_chunk(path: Path) -> bool:
     return bool(chunks)
 
 
-def _sentinel(summary: Summary, content: Mapping[str, Any]) -> Encoded:
+def sentinel(summary: Summary, content: Mapping[str, Any]) -> Encoded:
     """Return the sentinel for the file's last moment; nothing when the file has no channel for it."""
     for channel in summary.channels:
         if channel.topic == schema.SENTINEL:
             sequence = summary.last.get(channel.id, 0) + 1
             data = message(channel.id, sequence, summary.end, json.dumps(content).encode())
-            return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel.id, sequence, summary.end, 0)))
+            time = min(summary.end, I64_MAX)
+            return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel.id, sequence, time, 0)))
     none = np.zeros(0, dtype=np.int64)
     return Encoded(b"", none, none, none, none)
 
@@ -215,7 +242,7 @@ def _other(summary: Summary, data: bytes, opcode: int, body: int, end: int) -> b
 def recover_folder(folder: Path) -> list[Recovery]:
     """Recover every `.open` file of a folder that nobody is writing."""
     done = []
-    for path in sorted(folder.glob("*.mcap" + OPEN)):
+    for path in [path for path in logs_in(folder) if path.suffix == OPEN]:
         try:
             done.append(recover(path))
         except (LogError, OSError):  # in use, gone meanwhile, or no room: the next start tries again

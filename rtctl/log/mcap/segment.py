@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -14,16 +15,26 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from rtctl.log.header import Header, header_to_json
+from rtctl.log.mcap.names import INFO, OPEN
 from rtctl.log.mcap.rows import Encoded
 from rtctl.log.mcap.summary import MAGIC, Summary, message_indices, packed
 from rtctl.log.schema import Channel
+from rtctl.types import I64, U64
 
-OPEN = ".open"  # suffix while a file is being written
 CHUNK_BYTES = 256 << 10
+MODE = 0o640  # of log files: they tell what a robot does, and where
 LETTING_GO = 0.5  # [s] for which a lock may outlive the process it was of
 LEVEL = 1  # on such rows smaller and faster than 3
-INFO = "rtctl"  # the metadata record with the header
 MEDIA = {".urdf": "application/xml", ".zip": "application/zip", ".json": "application/json"}  # of attachments
+
+
+class Chunk(NamedTuple):
+    """A chunk's records, compressed."""
+
+    compression: str
+    size: int  # [bytes] uncompressed
+    crc: int  # of the uncompressed records; 0: none
+    data: bytes
 
 
 class Segment:
@@ -61,26 +72,40 @@ class Segment:
         bases = np.cumsum([0] + [len(e.data) for e in chunk[:-1]])
         offset = np.concatenate([e.offset + base for e, base in zip(chunk, bases, strict=True)])
         data = b"".join(e.data for e in chunk)
-        packed_data = self.compressor.compress(data)
-        start, end = int(time.min()), int(time.max())
-        head = struct.pack("<QQQI", start, end, len(data), isal_zlib.crc32(data)) + struct.pack("<I4s", 4, b"zstd")
-        head += struct.pack("<Q", len(packed_data))
-        record = struct.pack("<BQ", Opcode.CHUNK, len(head) + len(packed_data)) + head + packed_data
+        self.add_chunk(
+            Chunk("zstd", len(data), isal_zlib.crc32(data), self.compressor.compress(data)),
+            channel,
+            sequence,
+            time,
+            offset,
+        )
+
+    def add_chunk(self, chunk: "Chunk", channel: I64, sequence: I64, time: I64 | U64, offset: I64) -> None:
+        """Write a chunk as it is, and the indices of its messages, given in order.
+
+        Raises OSError when the disk does not take it.
+        """
+        start, end = (int(time.min()), int(time.max())) if len(time) else (0, 0)
+        name = chunk.compression.encode()
+        head = struct.pack("<QQQII", start, end, chunk.size, chunk.crc, len(name)) + name
+        head += struct.pack("<Q", len(chunk.data))
+        record = struct.pack("<BQ", Opcode.CHUNK, len(head) + len(chunk.data)) + head + chunk.data
         indices, starts = message_indices(channel, time, offset)
         at = self.size
         self.write(record + indices)
-        self.summary.add_messages(channel, sequence, time)
+        if len(time):
+            self.summary.add_messages(channel, sequence, time)
         self.summary.chunks.append(
             records.ChunkIndex(
                 chunk_length=len(record),
                 chunk_start_offset=at,
-                compression="zstd",
-                compressed_size=len(packed_data),
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
                 message_end_time=end,
                 message_index_length=len(indices),
                 message_index_offsets={number: at + len(record) + s for number, s in starts.items()},
                 message_start_time=start,
-                uncompressed_size=len(data),
+                uncompressed_size=chunk.size,
             )
         )
 
@@ -88,16 +113,20 @@ class Segment:
         """Wait until what has been written is on the disk."""
         os.fdatasync(self.file)
 
-    def finish(self) -> Path:
-        """Flush, close the file whole and give it its name; return that name."""
+    def end(self) -> None:
+        """Flush, and write what follows the last chunk; on the disk when this returns. May be tried again."""
         self.flush()
         metadata = list(self.summary.metadata)
         try:
             self.write(self.summary.tail(self.size))
         except OSError:
-            self.summary.metadata = metadata  # finish may be tried again
+            self.summary.metadata = metadata
             raise
         os.fsync(self.file)
+
+    def finish(self) -> Path:
+        """End the file and give it its name; return that name."""
+        self.end()
         settle(open_name(self.path), self.path)
         self.close()
         return self.path
@@ -149,7 +178,7 @@ def begin(path: Path, header: Header, channels: tuple[Channel, ...], stamp: int,
     stamp: log_time [ns] of the attachments; more: further metadata (clock offset, segment number).
     Raises OSError.
     """
-    file = os.open(open_name(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    file = os.open(open_name(path), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, MODE)
     summary = Summary()
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

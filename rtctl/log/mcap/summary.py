@@ -11,7 +11,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from rtctl.log.schema import Channel
-from rtctl.types import I64
+from rtctl.types import I64, U64
 
 MAGIC = b"\x89MCAP0\r\n"
 END = "rtctl.end"  # the metadata record with the sequence numbers of every topic
@@ -28,7 +28,7 @@ def packed(*items: records.McapRecord) -> bytes:
     return data
 
 
-def message_indices(channel: I64, time: I64, offset: I64) -> tuple[bytes, dict[int, int]]:
+def message_indices(channel: I64, time: I64 | U64, offset: I64) -> tuple[bytes, dict[int, int]]:
     """Return the message index records of a chunk, and where each channel's starts among them."""
     data = bytearray()
     starts: dict[int, int] = {}
@@ -79,23 +79,25 @@ class Summary:
 
     def add_attachment(self, at: int, name: str, media_type: str, content: bytes, time: int) -> bytes:
         """Return an attachment record for offset `at` of the file."""
-        data = packed(
-            records.Attachment(create_time=time, log_time=time, name=name, media_type=media_type, data=content)
-        )
+        return self.add_attachment_record(at, records.Attachment(time, time, name, media_type, content))
+
+    def add_attachment_record(self, at: int, found: records.Attachment) -> bytes:
+        """Return an attachment's record for offset `at` of the file."""
+        data = packed(found)
         self.attachments.append(
             records.AttachmentIndex(
                 offset=at,
                 length=len(data),
-                log_time=time,
-                create_time=time,
-                data_size=len(content),
-                name=name,
-                media_type=media_type,
+                log_time=found.log_time,
+                create_time=found.create_time,
+                data_size=len(found.data),
+                name=found.name,
+                media_type=found.media_type,
             )
         )
         return data
 
-    def add_messages(self, channel: I64, sequence: I64, time: I64) -> None:
+    def add_messages(self, channel: I64, sequence: I64, time: I64 | U64) -> None:
         """Count the messages of a chunk, given in order."""
         none_yet = not self.count
         for number in np.unique(channel).tolist():
@@ -110,11 +112,12 @@ class Summary:
     def sequences(self) -> dict[str, str]:
         """Return by topic the JSON of [messages, first sequence number, last sequence number]."""
         topics = {c.id: c.topic for c in self.channels}
-        return {
-            topics[number]: json.dumps([count, self.first[number], self.last[number]])
-            for number, count in sorted(self.count.items())
-            if number in topics
-        }
+        found: dict[str, list[int]] = {}
+        for number, count in sorted(self.count.items()):
+            if number in topics:  # several channels may be of one topic
+                row = found.setdefault(topics[number], [0, self.first[number], 0])
+                row[0], row[2] = row[0] + count, self.last[number]
+        return {topic: json.dumps(row) for topic, row in found.items()}
 
     def tail(self, at: int) -> bytes:
         """Return everything that follows the last chunk, for offset `at`: metadata, data end, summary, footer."""

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from rtctl.errors import LogError
 from rtctl.log import schema
-from rtctl.log.mcap.segment import OPEN
+from rtctl.log.mcap.names import OPEN
 from rtctl.log.mcap.summary import MAGIC
 from rtctl.log.mcap.walk import MESSAGE, RECORD, Damaged, chunk_data, chunk_head, chunk_messages, walk
 from rtctl.log.read.reader import read

@@ -5,7 +5,9 @@ from typing import Any
 
 from rtctl.errors import LogError
 from rtctl.log import schema
+from rtctl.log.mcap.names import INFO
 from rtctl.log.mcap.summary import WRAP
+from rtctl.log.read.examine import missing_numbers
 from rtctl.log.read.reader import Log, read
 
 
@@ -27,11 +29,12 @@ def info(path: Path | str) -> dict[str, Any]:
         "start_ns": start,
         "end_ns": stop,
         "duration_s": duration,
+        "beyond_2_63_ns": log.beyond,
         "topics": {
             name: {
                 "messages": n,
                 "hz": (n - 1) / duration if duration > 0.0 and n > 1 else 0.0,
-                "holes": (last - first + 1 - n) % WRAP if first or last else 0,
+                "holes": holes(log, name, n, first, last),
                 "schema": log.schema_of(name),
             }
             for name, (n, first, last) in sorted(counts.items())
@@ -41,6 +44,13 @@ def info(path: Path | str) -> dict[str, Any]:
         "sentinel": log.sentinel,
         **_origin(log),
     }
+
+
+def holes(log: Log, name: str, count: int, first: int, last: int) -> int:
+    """Return how many sequence numbers a topic lacks; 0 where another program's do not count its messages."""
+    if INFO in log.metadata:
+        return (last - first + 1 - count) % WRAP if first or last else 0
+    return sum(missing_numbers(numbers) or 0 for numbers in log.sequences(name))
 
 
 def _count(dropout: dict[str, Any]) -> int:

@@ -82,8 +82,12 @@ def inputs(
         requests = requests_of(log, span)
         for piece in log.pieces(schema.TICK) if span == EVERYTHING else (log.window(schema.TICK, *span),):
             records = piece.array
-            ticks, times = records["tick"].tolist(), piece.time.tolist()
-            for k, (tick, feedback) in enumerate(zip(ticks, feedbacks(records), strict=True)):
+            try:
+                made = list(feedbacks(records))
+                ticks, times = records["tick"].tolist(), piece.time.tolist()
+            except (ValueError, TypeError, KeyError) as error:  # numpy's, for a record without a field
+                raise LogError(f"{log.path}: its ticks are not those of such a robot: {error}") from None
+            for k, (tick, feedback) in enumerate(zip(ticks, made, strict=True)):
                 if expected not in (-1, tick):
                     missing = f"ticks {expected} to {tick - 1} are missing"
                     raise LogError(f"{log.path}: {missing}; what follows depends on them")

@@ -1,7 +1,6 @@
 """Reading logs: `read(path)["/tick"].q` is an array, whether the file is whole, cut off or still being written."""
 
 import contextlib
-import glob
 import mmap
 import os
 from collections.abc import Callable, Iterator
@@ -14,10 +13,10 @@ import numpy as np
 from mcap import records
 
 from rtctl.errors import LogError
-from rtctl.log import schema
+from rtctl.log import limits, schema
 from rtctl.log.header import Header, header_from_json, of_attachment
 from rtctl.log.mcap.catalog import Catalog, attachment, catalog, describe_chunk
-from rtctl.log.mcap.segment import INFO, OPEN
+from rtctl.log.mcap.names import INFO, OPEN, beside
 from rtctl.log.mcap.summary import INDEX_ENTRY
 from rtctl.log.mcap.walk import (
     I64_MAX,
@@ -28,6 +27,7 @@ from rtctl.log.mcap.walk import (
     chunk_data,
     chunk_head,
     chunk_messages,
+    clamped,
     rows_of,
 )
 from rtctl.log.mcap.walk import message_index as index_entries
@@ -44,14 +44,15 @@ PIECE = 64  # chunks at a time of `pieces`
 class Log:
     """One log file. Topics are read when they are asked for, and kept."""
 
-    def __init__(self, path: Path, data: Source) -> None:
+    def __init__(self, path: Path, data: Source, damaged: set[int] | None = None) -> None:
+        """damaged: of chunks that another reading of the file has met; those met now are added."""
         self.path = path
         self._data = data
         try:
             self._catalog: Catalog = catalog(data)
         except Damaged as error:
             raise LogError(f"{path}: {error}") from None
-        self._damaged: set[int] = set()
+        self._damaged = set[int]() if damaged is None else damaged  # where their records begin
         self._topics: dict[str, Topic] = {}
         if not self._catalog.channels or not self._catalog.complete:
             self._describe_from_chunks()
@@ -60,8 +61,9 @@ class Log:
     def _describe_from_chunks(self) -> None:
         known = set(self._catalog.channels)
         for k, channels in enumerate(self._catalog.chunks.channels()):
-            if not known.issuperset(channels.tolist()) or not known:
-                describe_chunk(self._catalog, self._chunk(k) or b"")
+            if not known.issuperset(channels.tolist()) or not known or not len(channels):
+                with contextlib.suppress(Damaged):  # what stands before it in the chunk is known
+                    describe_chunk(self._catalog, self._chunk(k) or b"")
                 known = set(self._catalog.channels)
 
     @property
@@ -119,6 +121,16 @@ class Log:
         return self._walked[1]
 
     @property
+    def bounds(self) -> tuple[int, int]:
+        """Return two log_times [ns] between which all messages lie, without reading them."""
+        chunks = self._catalog.chunks
+        if self._catalog.loose:
+            return 0, I64_MAX
+        if not len(chunks.body):
+            return 0, 0
+        return int(chunks.start_time.min()), int(chunks.end_time.max())
+
+    @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Return the metadata records by name."""
         return dict(self._catalog.metadata)
@@ -143,9 +155,20 @@ class Log:
         if self._header is None:
             text = self.metadata.get(INFO, {}).get("header", "")
             try:
+                if len(text) > limits.HEADER:
+                    raise ValueError(f"{len(text)} characters, at most {limits.HEADER} are read")
                 header = header_from_json(text)
-            except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
-                raise LogError(f"{self.path}: has no header of rtctl") from None
+            except (
+                ValueError,
+                TypeError,
+                KeyError,
+                IndexError,
+                AttributeError,
+                RecursionError,
+                OverflowError,
+            ) as error:
+                why = f": {error}" if text else ""
+                raise LogError(f"{self.path}: has no header of rtctl{why}") from None
             files = {name: of_attachment(name, data) for name, data in self.attachments.items()}
             config, urdf = str(files.pop("config.toml", "")), str(files.pop("robot.urdf", ""))
             self._header = header._replace(config=config, urdf=urdf, files=files)
@@ -155,7 +178,13 @@ class Log:
     def offset(self) -> int:
         """Return log_time - monotonic clock [ns] of this file; 0 when it does not say."""
         text = self.metadata.get(INFO, {}).get("clock_offset_ns", "0")
-        return int(text) if text.lstrip("-").isdigit() else 0
+        digits = text.removeprefix("-")
+        return int(text) if digits.isascii() and digits.isdigit() and len(digits) < 20 else 0
+
+    @property
+    def beyond(self) -> bool:
+        """Return whether a message is of a later time than 2^63 ns, of the year 2262: such a time reads as 2^63 - 1."""
+        return self.span[1] >= I64_MAX
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.topics)
@@ -191,6 +220,20 @@ class Log:
         """Return the spans in which entries are missing, each with its `count`."""
         return self[schema.DROPOUT].json if schema.DROPOUT in self.counts else []
 
+    @property
+    def data(self) -> Source:
+        """Return the file's bytes as they were when it was opened."""
+        return self._data
+
+    def sequences(self, topic: str) -> list[I64]:
+        """Return the sequence numbers of a topic, of each of its channels."""
+        ids = [i for i, channel in self._catalog.channels.items() if channel.topic == topic]
+        none = [np.zeros(0, np.int64)]
+        return [
+            np.concatenate(list(self._map(lambda part: part.sequence, i, slice(None), True, 0, I64_MAX)) or none)
+            for i in ids
+        ]
+
     def window(self, topic: str, start: int, stop: int) -> Topic:
         """Return the messages of a topic with start <= log_time < stop [ns], reading only the chunks they are in.
 
@@ -200,10 +243,26 @@ class Log:
 
     def pieces(self, topic: str) -> Iterator[Topic]:
         """Yield a topic some chunks at a time, so that any length fits into memory. Raises LogError without it."""
-        for at in range(0, len(self._catalog.chunks.body), PIECE):
-            yield self._topic(topic, slice(at, at + PIECE), False)
+        for part in self._runs_of_chunks():
+            yield self._topic(topic, part, False)
         if self._catalog.loose:
             yield self._topic(topic, slice(0), True)
+
+    def _runs_of_chunks(self) -> Iterator[slice]:
+        """Yield the chunks in runs of at most PIECE, and of at most limits.UNPACKED bytes if of more than one."""
+        first = size = 0
+        count = len(self._catalog.chunks.body)
+        for k in range(count):
+            try:
+                more = chunk_head(self._data, int(self._catalog.chunks.body[k]), int(self._catalog.chunks.end[k])).size
+            except Damaged:
+                more = 0
+            if k > first and (k - first >= PIECE or size + more > limits.UNPACKED):
+                yield slice(first, k)
+                first, size = k, 0
+            size += more
+        if count:
+            yield slice(first, count)
 
     def _topic(self, name: str, among: slice, loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
@@ -220,7 +279,7 @@ class Log:
         def source(work: Callable[[Part], T]) -> list[T]:
             return [done for i in ids for done in self._map(work, i, among, loose, start, stop)]
 
-        return Topic(name, channel, schema_name, dtype, source)
+        return Topic(name, channel, schema_name, dtype, source, limits.held(len(self._data)))
 
     def _map(
         self, work: Callable[[Part], T], channel: int, among: slice, loose: bool, start: int, stop: int
@@ -312,35 +371,34 @@ def _part(data: Source, offsets: I64, channel: int, start: int, stop: int) -> Pa
         offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
     head = rows_of(raw, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD).reshape(-1)
     time, at = head["log"], offsets + MESSAGE_HEAD.itemsize
-    good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start) & (time < min(stop, I64_MAX))
+    good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start)
+    if stop < I64_MAX:
+        good &= time < stop
     body = head["length"] - np.uint64(MESSAGE.size)  # wraps for a length that is too small: then it is too large
     good &= body <= (size - at).view(np.uint64)
     if not good.all():
         head, at, body = head[good], at[good], body[good]
-    return Part(data, at, body.view(np.int64), head["log"].astype(np.int64), head["sequence"].astype(np.int64))
+    return Part(data, at, body.view(np.int64), clamped(head["log"]), head["sequence"].astype(np.int64))
 
 
-def read(path: Path | str) -> Log:
-    """Open a log for reading.
+def read(path: Path | str, damaged: set[int] | None = None) -> Log:
+    """Open a log for reading; damaged: as of `Log`.
 
     Raises LogError when the file cannot be read or is not an MCAP file.
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would not even let itself be opened
+            raise ValueError("not a file")
         with path.open("rb") as file:
             # a file that is being written may be cut short by its writer, which a map would not survive
             mapped = path.suffix != OPEN and path.stat().st_size > 0
             data: Source = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if mapped else file.read()
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: {error}") from None
-    return Log(path, data)
+    return Log(path, data, damaged)
 
 
 def segments(path: Path | str) -> list[Path]:
-    """Return all files of the log that `path` is one of, in order (`name.000.mcap`, `name.001.mcap`, ...)."""
-    path = Path(path)
-    stem, dot, number = path.name.removesuffix(OPEN).removesuffix(".mcap").rpartition(".")
-    if not dot or not number.isdigit():
-        return [path]
-    pattern = f"{glob.escape(stem)}.[0-9]*.mcap"
-    return sorted([*path.parent.glob(pattern), *path.parent.glob(pattern + OPEN)]) or [path]
+    """Return all files of the run that a file is one of, in the order of their numbers."""
+    return [file for _, file in beside(Path(path))]

@@ -9,11 +9,13 @@ import numpy as np
 from mcap import records
 
 from rtctl.errors import LogError
-from rtctl.log import schema
+from rtctl.log import limits, schema
 from rtctl.log.mcap.walk import Source, rows_of
 from rtctl.log.schema import Layout, can_layout, tick_layout
 from rtctl.types import I64, U8
 
+OBJECT = 64  # [bytes] that a message costs beside its own, once it is an object
+STAMPS = 16  # [bytes] of a message's time and sequence number
 Structured = np.ndarray[Any, np.dtype[np.void]]
 CAN_ROW = np.dtype(  # of Topic.array for a bus
     [
@@ -45,6 +47,20 @@ class Part(NamedTuple):
 Mapped = Callable[[Callable[[Part], Any]], list[Any]]  # applies a function to each part, gives the results in order
 
 
+class Held:
+    """Counts what is kept of a topic while it is read, so that no file makes a reader keep more than it may."""
+
+    def __init__(self, name: str, most: int) -> None:
+        self.name, self.most, self.size = name, most, 0
+
+    def add(self, size: int) -> None:
+        """Count `size` [bytes] more. Raises LogError when they are too many."""
+        self.size += size
+        if self.size > self.most:
+            bound = f"more than {self.most >> 20} MiB at once; take a window of time, some fields, or pieces"
+            raise LogError(f"{self.name}: {bound}")
+
+
 class Topic:
     """The messages of one topic, in the order of the file; read when they are asked for.
 
@@ -53,9 +69,16 @@ class Topic:
     """
 
     def __init__(
-        self, name: str, channel: records.Channel, schema_name: str, dtype: np.dtype[np.void] | None, source: Mapped
+        self,
+        name: str,
+        channel: records.Channel,
+        schema_name: str,
+        dtype: np.dtype[np.void] | None,
+        source: Mapped,
+        most: int = limits.HELD,
     ) -> None:
         self.name = name
+        self.most = most  # [bytes] that are held at once
         self.encoding: str = channel.message_encoding
         self.schema = schema_name
         self.metadata: Mapping[str, str] = channel.metadata
@@ -129,10 +152,13 @@ class Topic:
     @cached_property
     def payloads(self) -> list[bytes]:
         """Return the messages as they were written."""
-        found = self.source(
-            lambda part: [part.data[a:b] for a, b in zip(part.at.tolist(), (part.at + part.size).tolist(), strict=True)]
-        )
-        return [payload for payloads in found for payload in payloads]
+        held = Held(self.name, self.most)
+
+        def take(part: Part) -> list[bytes]:
+            held.add(int(part.size.sum()) + OBJECT * len(part.size))
+            return [part.data[a:b] for a, b in zip(part.at.tolist(), (part.at + part.size).tolist(), strict=True)]
+
+        return [payload for payloads in self.source(take) for payload in payloads]
 
     @cached_property
     def array(self) -> Structured:
@@ -141,12 +167,15 @@ class Topic:
         Raises LogError for other topics, and when a message is not of the layout that the header describes.
         """
         _ = self.fields
-        if self.dtype is not None:
-            dtype, layout = self.dtype, tick_layout(self.dtype)
-            found = self.source(lambda part: (_records(self.name, part, layout, dtype), part.time, part.sequence))
-        else:
-            dtype = CAN_ROW
-            found = self.source(lambda part: (_frames(self.name, part), part.time, part.sequence))
+        dtype, held = CAN_ROW if self.dtype is None else self.dtype, Held(self.name, self.most)
+        layout = None if self.dtype is None else tick_layout(dtype)
+
+        def take(part: Part) -> tuple[Structured, I64, I64]:
+            held.add(dtype.itemsize * len(part.at))
+            rows = _frames(self.name, part) if layout is None else _records(self.name, part, layout, dtype)
+            return rows, part.time, part.sequence
+
+        found = self.source(take)
         self._stamps = _stamps([(times, sequences) for _, times, sequences in found])
         return stacked([rows for rows, _, _ in found], dtype)
 
@@ -157,7 +186,7 @@ class Topic:
 
     @cached_property
     def _ticks(self) -> "_Ticks":
-        return _Ticks(self.name, self.dtype if self.dtype is not None else np.dtype([]), self.source)
+        return _Ticks(self.name, self.dtype if self.dtype is not None else np.dtype([]), self.source, self.most)
 
 
 def _stamps(found: Sequence[tuple[I64, I64]]) -> tuple[I64, I64]:
@@ -168,8 +197,9 @@ def _stamps(found: Sequence[tuple[I64, I64]]) -> tuple[I64, I64]:
 class _Ticks:
     """The fields of constant-size messages: each read, by itself or with others, when it is first asked for."""
 
-    def __init__(self, name: str, dtype: np.dtype[np.void], source: Mapped) -> None:
+    def __init__(self, name: str, dtype: np.dtype[np.void], source: Mapped, most: int) -> None:
         self.name, self.source = name, source
+        self._held = Held(name, most)
         self.layout = tick_layout(dtype)
         self._times: tuple[I64, I64] | None = None
         self._found: dict[str, np.ndarray[Any, Any]] = {}
@@ -182,8 +212,10 @@ class _Ticks:
             return
         leads = [_lead(self.layout, at) for _, at in kinds.values()]
         template = self.layout.template
+        width = sum(kind.itemsize for kind, _ in kinds.values()) + STAMPS
 
         def take(part: Part) -> tuple[I64, I64, list[U8]]:
+            self._held.add(width * len(part.at))
             raw = _sized(self.name, part, self.layout)
             blocks = []
             for (kind, at), lead in zip(kinds.values(), leads, strict=True):
@@ -231,22 +263,6 @@ def stacked(arrays: Sequence[Structured], dtype: np.dtype[np.void]) -> Structure
     if len(arrays) == 1:
         return arrays[0]
     return np.concatenate([a.view(np.uint8) for a in arrays] or [np.zeros(0, np.uint8)]).view(dtype)
-
-
-def joined(parts: Sequence[Topic]) -> Topic:
-    """Return topics of one name and kind, one behind the other, as one."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    if any(part.dtype != first.dtype for part in parts):
-        raise LogError(f"{first.name}: the segments are of different layouts")
-    return Topic(
-        first.name,
-        first.channel,
-        first.schema,
-        first.dtype,
-        lambda work: [r for part in parts for r in part.source(work)],
-    )
 
 
 def _sized(name: str, part: Part, layout: Layout) -> U8:

@@ -4,10 +4,12 @@ import io
 import json
 import xml.etree.ElementTree as ET
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rtctl.errors import LogError
+from rtctl.log import limits
 
 MESHES = "meshes.zip"  # name of the attachment
 INDEX = "index.json"  # in it: what the URDF calls a mesh -> its name in the archive
@@ -49,17 +51,48 @@ def unpacked(urdf: str, config: str, files: Mapping[str, str | bytes], folder: P
         return urdf, config
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as zipped:
-            index = {str(k): str(v) for k, v in json.loads(zipped.read(INDEX)).items()}
+            _bounded(zipped)
+            index = {str(k): str(v) for k, v in json.loads(_content(zipped, INDEX)).items()}
+            for member in set(index.values()):
+                _place(folder, member).write_bytes(_content(zipped, member))
             for name, member in index.items():
-                path = folder / Path(member).name  # a name alone: an archive cannot write elsewhere
-                path.write_bytes(zipped.read(member))
+                path = _place(folder, member)
                 if name.startswith(ASSET):
                     config = _placed(config, name.removeprefix(ASSET), path)
                 else:
                     urdf = _placed(urdf, name, path)
-    except (zipfile.BadZipFile, ValueError, KeyError, AttributeError, EOFError, NotImplementedError) as error:
+    except (
+        zipfile.BadZipFile,
+        ValueError,
+        KeyError,
+        AttributeError,
+        EOFError,
+        NotImplementedError,
+        zlib.error,
+        RuntimeError,
+    ) as error:
         raise LogError(f"attachment {MESHES}: {error}") from None
     return urdf, config
+
+
+def _place(folder: Path, member: str) -> Path:
+    return folder / Path(member).name  # a name alone: an archive cannot write elsewhere
+
+
+def _content(zipped: zipfile.ZipFile, member: str) -> bytes:
+    """Return a member, no more of it than the archive's directory says: read() without a size unpacks all there is."""
+    with zipped.open(member) as file:
+        return file.read(zipped.getinfo(member).file_size)
+
+
+def _bounded(zipped: zipfile.ZipFile) -> None:
+    """Raise ValueError for an archive that says it is larger than any robot's meshes; reading holds it to its word."""
+    members = zipped.infolist()
+    size = sum(member.file_size for member in members)
+    if len(members) > limits.MEMBERS or size > limits.ARCHIVE:
+        raise ValueError(
+            f"{len(members)} files of {size} bytes, at most {limits.MEMBERS} of {limits.ARCHIVE} are unpacked"
+        )
 
 
 def _placed(text: str, name: str, path: Path) -> str:

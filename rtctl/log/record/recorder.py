@@ -7,6 +7,7 @@ how far that one came, and goes on behind it.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import select
@@ -21,13 +22,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rtctl.errors import LinkError, LogError
-from rtctl.log import schema
 from rtctl.log.entry import Batch, Kind
 from rtctl.log.header import Header, header_from_json, header_to_json
-from rtctl.log.mcap.recovery import recover, recover_folder
-from rtctl.log.mcap.segment import CHUNK_BYTES, OPEN, locked
-from rtctl.log.read.reader import read, segments
+from rtctl.log.mcap.names import OPEN, logs_in, plain, session_files
+from rtctl.log.mcap.recovery import entries_of, recover, recover_folder
+from rtctl.log.mcap.segment import CHUNK_BYTES, locked
 from rtctl.log.record import ring as rings
+from rtctl.log.record.health import DropWatch
 from rtctl.log.record.ring import Consumer, Producer, attach, create
 from rtctl.log.record.writer import Options, Session, segment_path
 from rtctl.trust import TrustError, plain_name
@@ -49,7 +50,7 @@ class Stats(NamedTuple):
     lost: int  # taken by the recorder but not written, since the disk was full
     backlog: int  # [bytes] not yet safe
     alive: bool  # the recorder runs
-    degraded: bool  # nothing is being written: refuse to arm
+    degraded: bool  # nothing is being written, or more than health.DROP_RATE is dropped: refuse to arm
     path: Path  # of the file that is being written (it ends in .open until it is whole)
 
 
@@ -60,6 +61,7 @@ class Recorder:
         self._ring = ring
         self._options = options
         self._process: subprocess.Popen[bytes] | None = None
+        self._drops = DropWatch()
         self.put = ring.put
         self.put_many = ring.put_many
         self.beat = ring.beat
@@ -83,8 +85,8 @@ class Recorder:
         kept by deleting the oldest logs of the directory; folders: for the ring file, /dev/shm first if not given.
         Raises LogError when the recorder does not come up, LinkError when no ring can be had.
         """
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3].replace(".", "")
-        options = Options(Path(directory).absolute(), f"{header.robot}-{stamp}Z", segment_s, segment_bytes, floor_bytes)
+        stem = _session_name(Path(directory), header.robot)
+        options = Options(Path(directory).absolute(), stem, segment_s, segment_bytes, floor_bytes)
         blob = json.dumps({"header": header_to_json(header), "options": [str(o) for o in options]}).encode()
         ring = create(f"{PREFIX}{options.stem}-{os.getpid()}{SUFFIX}", capacity, blob, folders)
         recorder = cls(ring, options)
@@ -125,7 +127,8 @@ class Recorder:
         counts = self._ring.counts()
         alive = self.alive
         path = segment_path(self._options, counts.segment)
-        degraded = counts.degraded or not alive
+        losing = self._drops.update(time.monotonic(), counts.number, counts.dropped)
+        degraded = counts.degraded or losing or not alive
         return Stats(counts.number, counts.dropped, counts.lost, counts.backlog, alive, degraded, path)
 
     def close(self, reason: str = "closed", detail: str = "", timeout: float = 10.0) -> Stats:
@@ -158,6 +161,14 @@ class Recorder:
         self._ring.unmap()
 
 
+def _session_name(directory: Path, robot: str) -> str:
+    """Return a name that no session of the folder has, whatever the clock says."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3].replace(".", "")
+    taken = {plain(path).rpartition(".")[0] for path in logs_in(directory)}
+    names = (f"{robot}-{stamp}Z{more}" for more in itertools.chain([""], (f"-{k}" for k in itertools.count(2))))
+    return next(name for name in names if name not in taken)
+
+
 def _options(blob: bytes) -> Options:
     """Return what a ring says of its log, with nothing in it that names another folder or breaks a bound.
 
@@ -177,17 +188,13 @@ def _options(blob: bytes) -> Options:
 
 def _predecessor(options: Options) -> tuple[int, int]:
     """Close what an earlier recorder of the same ring left; return the last entry it wrote and the next segment."""
-    files = [path for path in segments(segment_path(options, 0)) if path.exists()]
+    named = (path for path in logs_in(options.directory) if plain(path).rpartition(".")[0] == options.stem)
+    files = session_files(named, options.stem)
     number = 0
-    for path in files[-2:]:
-        if path.suffix == OPEN:
-            number = max(number, recover(path, {"reason": "recorder died"}).entries)
-        else:
-            log = read(path)
-            positions = log[schema.POSITION].json if schema.POSITION in log else []
-            number = max([number, *(int(p.get("entries", 0)) for p in positions[-1:])])
-    taken = [int(path.name.removesuffix(OPEN).rsplit(".", 2)[1]) for path in files]
-    return number, max(taken, default=-1) + 1
+    for _, path in files[-2:]:
+        found = recover(path, {"reason": "recorder died"}).entries if path.suffix == OPEN else entries_of(path)
+        number = max(number, found)
+    return number, max((k for k, _ in files), default=-1) + 1
 
 
 def _without(batch: Batch, number: int) -> tuple[Batch, str, str]:

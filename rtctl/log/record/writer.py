@@ -4,6 +4,7 @@ import contextlib
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +13,9 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.entry import Batch, Payload, empty, stream
 from rtctl.log.header import Header
+from rtctl.log.mcap.names import OPEN, PIN, Origin, logs_in, metadata, origin_of, plain, segment_name
 from rtctl.log.mcap.recovery import drop_last_chunk, recover
-from rtctl.log.mcap.segment import CHUNK_BYTES, Segment, begin, open_name
+from rtctl.log.mcap.segment import CHUNK_BYTES, MODE, Segment, begin, open_name
 from rtctl.log.record.encoding import Encoder
 
 CHUNK_TIME = 0.25  # [s] after which a chunk is written however small
@@ -34,16 +36,20 @@ class Options(NamedTuple):
 
 def segment_path(options: Options, number: int) -> Path:
     """Return the name of a session's segment."""
-    return options.directory / f"{options.stem}.{number:03d}.mcap"
+    return options.directory / segment_name(options.stem, number)
 
 
 def clock_offset() -> int:
-    """Return wall clock - monotonic clock [ns], from the closest of a few readings."""
+    """Return wall clock - monotonic clock [ns], from the closest of a few readings.
+
+    A wall clock that says it was set before the machine started, as one without a battery at 1970 may, is not one: the
+    log's times, which are never below zero, then are the monotonic clock's.
+    """
     readings = []
     for _ in range(5):
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         readings.append((after - before, wall - (before + after) // 2))
-    return min(readings)[1]
+    return max(min(readings)[1], 0)
 
 
 def free_bytes(folder: Path) -> int:
@@ -52,6 +58,27 @@ def free_bytes(folder: Path) -> int:
         return shutil.disk_usage(folder).free
     except OSError:
         return 0
+
+
+def old_segments(folder: Path) -> list[Path]:
+    """Return the closed segments of a folder that recorders wrote, the oldest session's first, each by its numbers.
+
+    Another program's files, and those that bear another name than their segment's, are nobody's to delete.
+    """
+    found = []
+    for path in logs_in(folder):
+        origin = origin_of(path) if path.suffix != OPEN else None
+        if origin is not None and path.name == segment_name(origin.session, origin.segment):
+            found.append((origin, path))
+    return [path for _, path in sorted(found)]
+
+
+def session_order(folder: Path, session: str) -> int:
+    """Return a session's place among those of a folder: its own where it has segments there, else behind all others."""
+    firsts = {plain(path).rpartition(".")[0]: path for path in logs_in(folder)}  # one file of each is enough
+    origins = [origin for origin in map(origin_of, firsts.values()) if origin is not None]
+    own = [origin.order for origin in origins if origin.session == session and origin.order]
+    return own[0] if own else max((origin.order for origin in origins), default=0) + 1
 
 
 class Session:
@@ -81,6 +108,8 @@ class Session:
         self._opened = self._flushed = self._synced = 0.0
         self._reserve = options.directory / f".{options.stem}.reserve"
         self._next = first
+        self._order = session_order(options.directory, options.stem)
+        self._oldest: deque[Path] = deque()  # logs of the folder that may be deleted, as last looked
         self.open()
 
     @property
@@ -101,8 +130,8 @@ class Session:
             while path.exists() or open_name(path).exists():  # never over another log
                 self._next += 1
                 path = segment_path(self.options, self._next)
-            offset = str(self.encoder.offset)
-            more = {"segment": str(self._next), "session": self.options.stem, "clock_offset_ns": offset}
+            origin = Origin(self._order, self.options.stem, self._next)
+            more = {**metadata(origin), "clock_offset_ns": str(self.encoder.offset)}
             self._segment = begin(path, self.header, self.encoder.channels, stamp, more)
         except OSError:
             self._segment, self.degraded = None, True
@@ -115,7 +144,7 @@ class Session:
         if self._reserve.exists():
             return
         with contextlib.suppress(OSError):
-            file = os.open(self._reserve, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            file = os.open(self._reserve, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, MODE)
             try:
                 os.posix_fallocate(file, 0, RESERVE)
             except OSError:
@@ -220,14 +249,22 @@ class Session:
         self.degraded = True
 
     def _make_room(self) -> bool:
-        """Delete the oldest logs of the folder until the floor is met; those with a `.pin` beside them stay."""
+        """Delete the oldest segments of the folder until the floor is met; those with a `.pin` beside them stay.
+
+        Which is older, sessions and their numbers tell, never a clock: after a start at 1970 yesterday's are older yet.
+        """
         folder = self.options.directory
-        old = [p for p in folder.glob("*.[0-9][0-9][0-9].mcap") if not p.with_name(p.name + ".pin").exists()]
-        for path in sorted(old, key=lambda p: p.stat().st_mtime):
-            with contextlib.suppress(OSError):
-                path.unlink()
-            if self._free(folder) >= self.options.floor_bytes:
-                return True
+        for looked in (False, True):
+            if looked:
+                self._oldest = deque(old_segments(folder))
+            while self._oldest:
+                path = self._oldest.popleft()
+                if path.with_name(path.name + PIN).exists():
+                    continue
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                if self._free(folder) >= self.options.floor_bytes:
+                    return True
         return False
 
     def close(self, content: Mapping[str, Any], number: int = 0) -> None:
