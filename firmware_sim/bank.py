@@ -5,6 +5,7 @@ What happens every period (a cycle's commands and replies, the passing of time) 
 `Drive`'s own Python: a `Slot` is a drive whose attributes are the cells of its row.
 """
 
+import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -126,9 +127,21 @@ class Bank:
         self.i: I64 = np.zeros((n, cells.INTS), dtype=np.int64)
         self.drives = [Slot(r, f, i) for r, f, i in zip(ratings, self.f, self.i, strict=True)]
         self.torque, self.drag = np.zeros(n), np.zeros(n)  # what each joint gets [Nm]
-        self._q, self._qd = np.zeros(n), np.zeros(n)
+        self._room = bytearray(16 * n)
+        self._motion: F64 = np.frombuffer(self._room, dtype=np.float64).reshape(2, n)  # q, qd as the joints truly are
+        self._pack = struct.Struct(f"{2 * n}d").pack_into
         size, e2e = CANFD_MTU if fd else CAN_MTU, any(r.e2e for r in ratings)
-        self._forms = [np.array((size, fd, e2e, clocked), dtype=np.int64) for clocked in (False, True)]
+        self._forms: list[I64] = [np.array((size, fd, e2e, clocked), dtype=np.int64) for clocked in (False, True)]
+
+        self._warm()
+
+    def _warm(self) -> None:
+        """Have everything compiled, or loaded: on no drives and no frames."""
+        f, i, none = self.f[:0], self.i[:0], Batch(1)
+        bank_kernels.answer(f, i, self._forms[0], none.raw, none.lengths[:0], 0, none.raw, 0)
+        bank_kernels.actuate(f, i, 1, self.torque, self.drag)
+        bank_kernels.sense(f, i, self._motion)
+        bank_kernels.close_period(f, i)
 
     def answer(self, came: Batch, replies: Batch, first: int, clocked: bool) -> tuple[int, int]:
         """Take the frames of a batch from `first` on, and add the replies to another.
@@ -151,8 +164,8 @@ class Bank:
 
     def sense(self, q: Sequence[float], qd: Sequence[float]) -> None:
         """Let every drive take its joint's true position [rad] and speed [rad/s]."""
-        self._q[:], self._qd[:] = q, qd
-        if bank_kernels.sense(self.f, self.i, self._q, self._qd):
+        self._pack(self._room, 0, *q, *qd)
+        if bank_kernels.sense(self.f, self.i, self._motion):
             self._write_down()
 
     def close_period(self) -> None:

@@ -132,12 +132,13 @@ def actuate(F: F64, I: I64, dt_ns: int, torque: F64, drag: F64) -> tuple[bool, b
 
 
 @kernel
-def sense(F: F64, I: I64, q: F64, qd: F64) -> bool:
-    """Let all drives take the true joint positions [rad] and speeds [rad/s]; return whether one has an event."""
+def sense(F: F64, I: I64, motion: F64) -> bool:
+    """Let all drives take the true positions [rad] and speeds [rad/s], (2, n); return whether one has an event."""
     event = False
     for k in range(len(F)):
-        if math.isfinite(q[k]) and math.isfinite(qd[k]):
-            F[k, c.Q], F[k, c.QD] = q[k] - F[k, c.ZERO], qd[k]
+        q, qd = motion[0, k], motion[1, k]
+        if math.isfinite(q) and math.isfinite(qd):
+            F[k, c.Q], F[k, c.QD] = q - F[k, c.ZERO], qd
         else:
             _trip(F[k], I[k], OVERLOAD)
         event |= I[k, c.EVENT] != 0

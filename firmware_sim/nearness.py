@@ -85,6 +85,8 @@ class Nearness:
         self.groups[HORIZON] = horizon
         self._seen: F64 = np.zeros(reach.shape[1])
         self._q: F64 = np.zeros(reach.shape[1])
+        self.begin(self._q.tolist(), True)  # once without effect: everything is compiled now, or loaded
+        self.learn(-1, 0.0)
 
     def unknown(self, group: int, present: bool) -> None:
         """Forget a group's distances: all must be measured, or none where it is not there."""

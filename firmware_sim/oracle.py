@@ -87,6 +87,7 @@ class Oracle:
         self._self = Nearness(np.array(between).reshape(-1, len(arm.joints)), np.zeros(1), SELF_SIGHT)
         self._self.unknown(0, True)
         self._names = [s.name for s in obstacles.solids]
+        self._place = {name: k for k, name in enumerate(self._names)}
         self._sight = [BEYOND if s.mesh is not None and not s.mesh.hull else FAR for s in obstacles.solids]
 
     def forget(self, k: int) -> None:
@@ -153,11 +154,12 @@ class Oracle:
                 arm.body, bodies[self._names[k]], sight, self.shaped[link], physicsClientId=arm.client
             )
             pair = near.learn(pair, _least(points, sight))
-        found = dict(zip(self._names, near.told(), strict=True))
-        return {
-            name: found[name] if name not in self.scans else self._cloud_clearance(name, body, now, before)
-            for name, body in bodies.items()
-        }
+        told, place = near.told(), self._place
+        found = {name: told[place[name]] for name in bodies}
+        for name in self.scans:
+            if name in bodies:
+                found[name] = self._cloud_clearance(name, bodies[name], now, before)
+        return found
 
     def _cloud_clearance(self, name: str, body: int, now: State, before: State) -> float:
         """Return the smallest distance of any moving link to the balls of a cloud [m], at most SIGHT.

@@ -119,6 +119,7 @@ class Plant:
         for i in movable:
             pb.setJointMotorControl2(self.body, i, pb.VELOCITY_CONTROL, force=0.0, physicsClientId=self.client)
         self.armature = np.array([j.armature for j in self.settings.joints])
+        self._rotors = np.diag(self.armature)
         self.friction = np.array([j.friction for j in self.settings.joints])
         self.motors = bool(self.armature.any() or self.friction.any())
 
@@ -183,7 +184,7 @@ class Plant:
         A = np.array(pb.calculateMassMatrix(self.body, self.q, physicsClientId=self.client))
         bias = pb.calculateInverseDynamics(self.body, self.q, self.qd, [0.0] * len(self.q), physicsClientId=self.client)
         tau = np.asarray(torque, dtype=np.float64) - self.friction * np.array(self.qd)
-        qdd = np.linalg.solve(A + np.diag(self.armature), tau - np.array(bias))
+        qdd = np.linalg.solve(A + self._rotors, tau - np.array(bias))
         result: list[float] = (tau - self.armature * qdd).tolist()
         return result
 
