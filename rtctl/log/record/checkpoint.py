@@ -61,7 +61,8 @@ def decode_checkpoint(data: bytes, robot: Robot, template: Memory) -> Checkpoint
         memory = Memory(**{name: _value(node, hints[name], raw) for name, node in values})
         memory = _with_meshes(memory, robot)
         _check(memory, template)
-        return Checkpoint(memory, tuple(int(c) & 0xFF for c in body["counters"]))
+        shapes = shapes_of(memory.placed.obstacles, memory.placed.moving)  # made anew: they are not checked singly
+        return Checkpoint(memory._replace(shapes=shapes), tuple(int(c) & 0xFF for c in body["counters"]))
     except (msgspec.MsgspecError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise ValueError(f"not a checkpoint: {error}") from None
 
@@ -150,7 +151,7 @@ def _with_meshes(memory: Memory, robot: Robot) -> Memory:
     if not np.isin(meshes[:, 3], bodies).all() or not ((obstacles.group >= 0) & (obstacles.group < robot.slots)).all():
         raise ValueError("not a checkpoint of this robot: obstacles")
     placed = memory.placed._replace(known=robot.meshes, obstacles=obstacles)
-    return memory._replace(placed=placed, shapes=shapes_of(obstacles, placed.moving))
+    return memory._replace(placed=placed)
 
 
 def _check(memory: Memory, template: Memory) -> None:
