@@ -137,6 +137,20 @@ def test_a_way_once_chosen_is_kept_before_the_middle_of_a_wall_and_left_when_it_
     assert np.sign(way.corners[0, 1]) == -side
 
 
+def test_a_wall_whose_returns_move_by_a_cell_with_each_scan_does_not_change_the_side():
+    goal, none = np.array([16.0, 0.0]), obstacle_table.empty().obstacles
+    way, sides = path.NO_WAY, set()
+    for k in range(24):
+        x = np.array([0.15 * k, 0.02 * (-1) ** k])
+        low, high = -5.0 - 0.7 * (k % 2), 5.0 + 0.7 * (1 - k % 2)
+        wall = [(8.0 - 0.35 * (k % 3), y) for y in np.arange(low, high, 0.2)]
+        seen = charted(wall)
+        way = path.way_to(occupancy.free_distance(seen, none, 0.3), seen.origin, x, goal, 1.3, way)
+        assert way.short == 0.0
+        sides.add(float(np.sign(way.corners[0, 1])))
+    assert len(sides) == 1
+
+
 def test_the_push_of_returns_is_the_gradient_of_the_potential_and_does_not_grow_with_resolution():
     f = BASE.field
 

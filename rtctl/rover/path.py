@@ -19,6 +19,7 @@ from rtctl.types import F64, I64
 CORNERS = 32  # of a way at most
 KEEP = 1.10  # a new way must be shorter than the old by this factor
 KEEP_LENGTH = 0.7  # [m] and by this
+NEAR_VIA = 1.5  # [m] from a corner of a closed way within which the same side is still open
 
 
 class Way(NamedTuple):
@@ -42,7 +43,27 @@ def way_to(free: F64, origin: I64, x: F64, goal: F64, room: float, old: Way) -> 
     kept = remaining(free, origin, x, old, room)
     if len(kept.corners) and kept.short <= short + CELL and kept.length <= KEEP * new.length + KEEP_LENGTH:
         return kept
+    if len(old.corners) and not len(kept.corners):
+        same = _by_way_of(free, origin, x, old.corners[0], goal, room)
+        if same.short <= short + CELL and same.length <= KEEP * new.length + KEEP_LENGTH:
+            return same
     return new
+
+
+def _by_way_of(free: F64, origin: I64, x: F64, via: F64, goal: F64, room: float) -> Way:
+    """Return the way to the goal past the free place nearest to via (2,) [m], NO_WAY when none is near.
+
+    A range sensor's noise moves a wall by a cell, which closes a way that grazes it: the next best on the same side is
+    as good. Without this a base before the middle of a wall changes sides with each scan.
+    """
+    first, k, _ = _search(free, origin, x, via, room)
+    if not k or math.dist(first[k - 1], via) > NEAR_VIA:
+        return NO_WAY
+    rest, n, short = _search(free, origin, first[k - 1], goal, room)
+    corners = np.concatenate([first[:k], rest[:n]])[:CORNERS]
+    whole = Way(corners, _length(x, corners), short)
+    left = remaining(free, origin, x, whole, room)
+    return left if len(left.corners) else whole
 
 
 def remaining(free: F64, origin: I64, x: F64, way: Way, room: float) -> Way:
