@@ -17,12 +17,13 @@ from rtctl.kernel.rotations import R_of
 from rtctl.log import read
 from rtctl.spec.scenario import load_scenario
 from rtctl.types import F64, Goal, Shape, State, Task
+from rtctl.world.outline import axis_view
+from rtctl.world.outline import outline as outline_of
 from tests.arms import NO_POINTS, panda
 from tests.rig import ROOT, config_at
 from tools import demo, player
 from tools.outcome import Given, GoalOutcome, Outcome, judge
 from tools.pair import Child, DemoError, working_copy
-from tools.plot import silhouette
 from tools.trace import Trace
 
 GOALS = [(0.45, 0.2, 0.45), (0.45, -0.2, 0.45)]
@@ -402,7 +403,7 @@ def test_an_outline_is_the_hull_of_the_solid_s_shadow(kind: str, dims: list[floa
     place = np.array([0.3, -0.2, 0.5])
     shape = Shape("it", kind, d, place, wxyz / np.linalg.norm(wxyz), np.zeros(3), np.zeros(3))
     shadow = (place + surface(kind, dims, rng) @ R_of(shape.wxyz).T)[:, plane]
-    hull, outline = ConvexHull(shadow), ConvexHull(silhouette(shape, plane))
+    hull, outline = ConvexHull(shadow), ConvexHull(outline_of(shape, axis_view(*plane)))
     assert outline.volume == pytest.approx(hull.volume, rel=0.01)
     outside = (outline.equations[:, :2] @ shadow.T + outline.equations[:, 2:]).max(0)
     assert outside.max() < 2e-3  # [m], between two of its corners

@@ -29,11 +29,13 @@ from rtctl import design as cfg
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError
 from rtctl.hal import clock
 from rtctl.hal.client import Session, accepted
+from rtctl.log import read_run
+from rtctl.log.view.report import gather
+from rtctl.log.view.sheet import draw
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
-from tools.outcome import WIDTH, Outcome, judge, show
+from tools.outcome import WIDTH, Outcome, judge, notes_of, show
 from tools.pair import DemoError, Pair, placed, working_copy
 from tools.player import play
-from tools.plot import draw
 from tools.trace import trace
 
 __all__ = ["main", "play"]
@@ -203,7 +205,7 @@ def _attempt(
     run = trace(log, cfg.load(config), played.began)
     outcome = judge(run, pair.report(), played.given, len(scenario.goal), played.end, played.ended, pair.exits)
     plot = out / "demo.png"
-    draw(run, outcome, mode, plot)
+    draw(gather(read_run(log)), plot, notes_of(outcome, run.period, lockstep))
     show(outcome, mode, {"log": log, "report": str(pair.report_file), "plot": str(plot)}, voice.console)
     return outcome
 

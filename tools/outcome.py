@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rtctl.arm.task import turns
+from rtctl.log.view.style import Goal, Notes
 from rtctl.types import F64
 from tools.trace import Trace
 
@@ -109,6 +110,26 @@ def judge(
         ended=ended,
         exits=dict(exits),
     )
+
+
+def notes_of(outcome: Outcome, period: float, lockstep: bool) -> Notes:
+    """Return what the picture of a run tells beside its log; period: [s] of the servo."""
+    reached = sum(g.reached for g in outcome.goals)
+    deadlines = () if lockstep else (f"{outcome.missed} of {outcome.slots} deadlines missed",)
+    words = (
+        f"{reached} of {len(outcome.goals) + len(outcome.never)} goals reached",
+        f"{len(outcome.contacts)} contacts",
+        *deadlines,
+        f"{1.0 / period:.0f} Hz in {'lockstep' if lockstep else 'real time'}",
+        f"faults: {', '.join(outcome.faults) or 'none'}",
+    )
+    goals = tuple(
+        Goal(g.given.number, g.given.position, g.given.slot * period, g.reached)
+        for g in outcome.goals
+        if not g.given.refusal
+    )
+    verdict = "FAIL" if outcome.failures else "PASS"
+    return Notes("An arm goes round obstacles", verdict, words, goals, tuple(outcome.clearance.items()), lockstep)
 
 
 def _refused(trace: Trace, given: Given) -> GoalOutcome:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from matplotlib.patches import Polygon
 
-from rtctl.experiment.outline import Figurine, View, outline
+from rtctl.experiment.outline import Figurine, Projection, outline
 from rtctl.experiment.scene import Trace
 from rtctl.experiment.style import FAINT, INK, PAPER, PLINTH, STONE, Axes, shade, thinned
 from rtctl.types import F64, I64, Shape
@@ -19,7 +19,7 @@ def strobes(q: F64, count: int) -> I64:
     return np.searchsorted(way, np.linspace(0.0, way[-1] * (1.0 - 1e-9), count)).clip(max=len(q) - 1)
 
 
-def draw_shapes(axes: Axes, shapes: Iterable[Shape], seen: View, colour: str = STONE, alpha: float = 1.0,
+def draw_shapes(axes: Axes, shapes: Iterable[Shape], seen: Projection, colour: str = STONE, alpha: float = 1.0,
                 zorder: float = 3.0) -> None:  # fmt: skip
     """Draw obstacles as solids with an outline."""
     for shape in shapes:
@@ -29,7 +29,7 @@ def draw_shapes(axes: Axes, shapes: Iterable[Shape], seen: View, colour: str = S
             axes.add_patch(Polygon(ring, fc="none", ec=INK, lw=1.2, alpha=alpha, zorder=zorder + 0.1))
 
 
-def half_space(shape: Shape, seen: View) -> F64:
+def half_space(shape: Shape, seen: Projection) -> F64:
     """Return a plane's solid side (4, 2) [m] where it is seen edge on; nothing where it is not."""
     from rtctl.kernel.rotations import R_of
 
@@ -40,7 +40,7 @@ def half_space(shape: Shape, seen: View) -> F64:
     return np.array([point - along, point + along, point + along - normal * REACH, point - along - normal * REACH])
 
 
-def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: View, colour: tuple[float, float, float] | str,
+def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: Projection, colour: tuple[float, float, float] | str,
              zorder: float, edge: str | tuple[float, float, float] = PAPER, lw: float = 0.7) -> None:  # fmt: skip
     """Draw the solids of an arm at q (n,), the nearest to the beholder last."""
     for piece in figurine.pieces(q, seen):
@@ -49,7 +49,7 @@ def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: View, colour: tuple[f
         axes.add_patch(Polygon(piece.polygon, fc=fc, ec=ec, lw=lw, joinstyle="round", zorder=4.0 if still else zorder))
 
 
-def draw_strobes(axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[int] | I64, seen: View,
+def draw_strobes(axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[int] | I64, seen: Projection,
                  zorder: float = 5.0) -> None:  # fmt: skip
     """Draw an arm at several rows of a trace, from light to dark."""
     for k, row in enumerate(rows):
@@ -57,7 +57,7 @@ def draw_strobes(axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[in
         draw_arm(axes, figurine, trace.q[row], seen, shade(part), zorder + part, edge=shade(min(part + 0.35, 1.0)))
 
 
-def draw_way(axes: Axes, tip: F64, seen: View, colour: str, zorder: float = 8.0, lw: float = 2.0) -> None:
+def draw_way(axes: Axes, tip: F64, seen: Projection, colour: str, zorder: float = 8.0, lw: float = 2.0) -> None:
     """Draw the path (T, 3) of a tip, on paper so that it can be read over the arm."""
     (points,) = thinned(seen.of(tip))
     axes.plot(points[:, 0], points[:, 1], color=PAPER, lw=lw + 2.0, zorder=zorder)

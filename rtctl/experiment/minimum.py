@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
-from rtctl.experiment.outline import Figurine, View, axis_view
+from rtctl.experiment.outline import Figurine, Projection, axis_view
 from rtctl.experiment.scene import CONFIGS, Say, Trace, config_file, played, unsaid
 from rtctl.experiment.style import BLUE, FRONT, INK, RED, Axes, note, page, thinned
 from rtctl.types import F64
@@ -93,7 +93,7 @@ def draw(data: Data) -> Figure:
     return figure
 
 
-def _ways(axes: Axes, case: Case, seen: View, title: str) -> None:
+def _ways(axes: Axes, case: Case, seen: Projection, title: str) -> None:
     """Both ways of the tip; the arm where it stayed, and as it went."""
     figurine = Figurine(case.helped.robot.body)
     under = case.helped.time > AT

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
-from rtctl.experiment.outline import Figurine, View, axis_view, view
+from rtctl.experiment.outline import Figurine, Projection, axis_view, view
 from rtctl.experiment.scene import Say, Trace, unsaid
 from rtctl.experiment.style import BLUE, FAINT, FRONT, GREEN, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
 from rtctl.experiment.tour import arrivals, leg, numbers, tour
@@ -69,7 +69,7 @@ def draw(data: Data) -> Figure:
     return figure
 
 
-def _drawing(axes: Axes, data: Data, figurine: Figurine, seen: View, first: int, last: int) -> None:
+def _drawing(axes: Axes, data: Data, figurine: Figurine, seen: Projection, first: int, last: int) -> None:
     """Draw legs in one view: obstacles behind the arm, frames from light to dark, the way of the tip."""
     trace = data.trace
     rows = leg(trace, first, last)

@@ -10,6 +10,7 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.read.fields import FIELDS, unit_of
 from rtctl.log.read.run import Run
+from rtctl.log.view.report.gather import Slots
 from rtctl.types import F64
 
 BINS = 1500  # across a picture; more samples are drawn as the band between their smallest and largest
@@ -70,17 +71,16 @@ def plot(run: Run, names: Sequence[str], path: Path, start: float = 0.0, stop: f
             f"{run.path}: no tick between {start:g} and {stop:g} s; it lasts {time[-1] if len(time) else 0:.3f} s"
         )
     fig, axes = figure(len(names))
-    joints = run.header.joints
     for ax, name in zip(axes[:, 0], names, strict=True):
         values = topic.field(name)[rows].astype(np.float64).reshape(int(rows.sum()), -1)
+        labels = parts_of(run, name, values.shape[1])
         shown = [
             i
             for i in range(values.shape[1])
             if np.isfinite(values[:, i]).any() and (name != "force" or values[:, i].any())
         ]
         for i in shown:
-            label = joints[i] if values.shape[1] == len(joints) else str(i)
-            ax.plot(*envelope(time[rows], values[:, i]), linewidth=0.8, label=label if values.shape[1] > 1 else None)
+            ax.plot(*envelope(time[rows], values[:, i]), linewidth=0.8, label=labels[i] if labels else None)
         unit = unit_of(name)
         ax.set_ylabel(f"{name}{f' [{unit}]' if unit else ''}")
         ax.set_title(FIELDS[name].text if name in FIELDS else name, fontsize=9, loc="left")
@@ -89,6 +89,37 @@ def plot(run: Run, names: Sequence[str], path: Path, start: float = 0.0, stop: f
             ax.legend(fontsize=7, loc="upper right", ncols=4)
     axes[-1, 0].set_xlabel("time [s]")
     save(fig, path)
+
+
+VECTORS = {  # names of the parts of fields that are not one a joint or a slot
+    **dict.fromkeys(("x", "xd", "goal", "omega", "goal_axis"), ("x", "y", "z")),
+    **dict.fromkeys(("wxyz", "goal_wxyz"), ("w", "x", "y", "z")),
+    "F": ("x", "y", "z", "about x", "about y", "about z"),
+}
+
+
+def parts_of(run: Run, name: str, count: int) -> tuple[str, ...]:
+    """Return the names of a field's `count` numbers: axes, joints, or the obstacles that had the slots; () for one."""
+    header = run.header
+    if count == 1:
+        return ()
+    if len(VECTORS.get(name, ())) == count:
+        return VECTORS[name]
+    if name in ("rho", "force", "point") and count % max(header.slots, 1) == 0:
+        names = slot_names(run)
+        each = count // header.slots
+        return tuple(text if each == 1 else f"{text} {'xyz'[k]}" for text in names for k in range(each))
+    return header.joints if count == len(header.joints) else tuple(f"{name} {i}" for i in range(count))
+
+
+def slot_names(run: Run) -> list[str]:
+    """Return by slot the names of the obstacles that had it, one after another."""
+    owners = Slots(run, run.header).owner
+    found = []
+    for slot in range(run.header.slots):
+        names = dict.fromkeys(name for _, name in owners.get(slot, ()) if name)
+        found.append(", then ".join(names) or f"slot {slot}")
+    return found
 
 
 def plot_pair(

@@ -38,8 +38,9 @@ class Way(NamedTuple):
     name: str
     type: str
     dims: list[float]
-    path: list[list[float]]  # [m] positions, thinned
+    path: list[list[float]]  # [m] positions
     wxyz: list[float]
+    ticks: list[int]  # of each position: since when it was there
 
 
 class Gathered(NamedTuple):
@@ -56,6 +57,7 @@ class Gathered(NamedTuple):
     cuts: list[Span]
     obstacles: list[Way]
     goals: list[list[float]]  # [m] as they were asked for
+    asked: list[float]  # [s] when
     limits: dict[str, F64]  # q_min, q_max, tau_max, qd_max (n,), v_max (1,)
     figures: dict[str, Any]
     bus: dict[str, tuple[F64, F64]]  # topic -> times [s] and load [0..1]
@@ -104,7 +106,7 @@ class _Bits:
         return sorted(span for turns in self._turns.values() for span in turns.done(period))
 
 
-class _Slots:
+class Slots:
     """Which obstacle was in which slot, and where: from the requests."""
 
     def __init__(self, run: Run, header: Header) -> None:
@@ -112,48 +114,51 @@ class _Slots:
         self.owner: dict[int, list[tuple[int, str]]] = {}  # slot -> (from tick, name)
         self.ways: dict[str, Way] = {}
         self.goals: list[list[float]] = []
+        self.asked: list[int] = []  # ticks
         for slot in range(header.slots):
             if name := scene.name_of(slot):
                 self.owner[slot] = [(-1, name)]
         for shape in scene.shapes():
-            self._seen(shape)
+            self._seen(shape, 0)
         previous = {slot: rows[-1][1] for slot, rows in self.owner.items()}
         for payload in run[schema.REQUEST].payloads if schema.REQUEST in run else ():
             body = event_of(payload)
+            tick = body["tick"] if isinstance(body.get("tick"), int) else 0
             if isinstance(body.get("goal"), dict):
-                self._aimed(body["goal"])
+                self._aimed(body["goal"], tick)
             if not body.get("obstacles"):
                 continue
-            tick = body.get("tick", 0)
             scene.request(payload, 0.0)
             for edit in body["obstacles"] if isinstance(body["obstacles"], list) else ():
                 if isinstance(edit, dict) and isinstance(edit.get("shape"), dict):
-                    self._seen({**edit["shape"], "name": edit.get("name", "")})
+                    self._seen({**edit["shape"], "name": edit.get("name", "")}, tick)
             for slot in range(header.slots):
                 name = scene.name_of(slot)
                 if name != previous.get(slot, ""):
-                    self.owner.setdefault(slot, []).append((tick if isinstance(tick, int) else 0, name))
+                    self.owner.setdefault(slot, []).append((tick, name))
                     previous[slot] = name
 
-    def _aimed(self, goal: dict[str, Any]) -> None:
+    def _aimed(self, goal: dict[str, Any], tick: int) -> None:
         try:
             x, y, z = (round(float(v), 4) for v in goal["position"])
         except (KeyError, TypeError, ValueError):
             return
         if all(map(math.isfinite, (x, y, z))) and (not self.goals or self.goals[-1] != [x, y, z]):
             self.goals.append([x, y, z])
+            self.asked.append(tick)
 
-    def _seen(self, shape: dict[str, Any]) -> None:
+    def _seen(self, shape: dict[str, Any], tick: int) -> None:
         try:
             name, p = str(shape["name"]), [round(float(v), 4) for v in shape["position"]]
             dims, wxyz = [float(v) for v in shape["dims"]], [float(v) for v in shape["wxyz"]]
         except (KeyError, TypeError, ValueError):
             return
         old = self.ways.get(name)
-        path = old.path if old is not None else []
+        path, ticks = (old.path, old.ticks) if old is not None else ([], [])
         if not path or path[-1] != p:
             path.append(p)
-        self.ways[name] = Way(name, str(shape.get("type", "")), dims, path, wxyz)
+            ticks.append(tick)
+        self.ways[name] = Way(name, str(shape.get("type", "")), dims, path, wxyz, ticks)
 
     def mine(self, slot: int, tick: np.ndarray[Any, Any]) -> "list[tuple[str, np.ndarray[Any, Any]]]":
         """Return by name the rows in which that obstacle had the slot."""
@@ -173,7 +178,7 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     total = run.count(schema.TICK)
     if not total:
         raise LogError(f"{run.path}: no tick in it: nothing to report")
-    bins, slots = Bins(total), _Slots(run, header)
+    bins, slots = Bins(total), Slots(run, header)
     spectrum = Spectrum(len(header.joints), 1.0 / header.period)
     lateness, compute = Histogram(), Histogram()
     limits = limits_of(header)
@@ -182,7 +187,7 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     faults = _Bits({1 << i: name for i, name in enumerate(fault_table(header))})
     cuts = _Bits({int(cut): cut.name.lower() for cut in Cut if cut and cut.name})
     figures = _Figures()
-    done = 0
+    done, marks = 0, list[tuple[int, float]]()
     for piece in run.pieces(schema.TICK):
         records = piece.array
         if not len(records):
@@ -199,6 +204,7 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
         if "tau_sent" in (records.dtype.names or ()):
             spectrum.add(records["tau_sent"])
         figures.add(records)
+        marks += [(int(records["tick"][k]), float(records["time"][k])) for k in (0, -1)]
         done += len(records)
         progress(90 * done // total)
     period = header.period
@@ -206,7 +212,9 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     bus = {name: _bus_load(run, name, header) for name in run.topics if name.startswith(schema.can_topic(""))}
     return Gathered(
         header, bins, lateness, compute, spectrum, states.done(period), statuses.done(period), faults.done(period),
-        cuts.done(period), list(slots.ways.values()), slots.goals, limits, figures.as_dict(), bus, events,
+        cuts.done(period), list(slots.ways.values()), slots.goals,
+        np.interp(slots.asked, *np.array(marks, np.float64).T).tolist() if slots.asked else [],
+        limits, figures.as_dict(), bus, events,
     )  # fmt: skip
 
 
@@ -229,7 +237,7 @@ def _fill(bins: Bins, r: Structured, header: Header, limits: dict[str, F64]) -> 
         bins.columns("margin", np.minimum(r["q"] - limits["q_min"], limits["q_max"] - r["q"]), joints)
 
 
-def _obstacles(bins: Bins, r: Structured, slots: _Slots) -> None:
+def _obstacles(bins: Bins, r: Structured, slots: Slots) -> None:
     rho = r["rho"]
     active = np.flatnonzero(np.isfinite(rho).any(axis=0))
     for slot in active.tolist():

@@ -35,7 +35,7 @@ def page(run: Run, g: Gathered) -> str:
         "cuts": _spans(g.cuts),
         "plots": plots(g),
         "tip": _tip(g),
-        "ways": [w._asdict() | {"path": _thinned(w.path)} for w in g.obstacles],
+        "ways": [w._replace(ticks=[])._asdict() | {"path": _thinned(w.path)} for w in g.obstacles],
         "spectrum": _spectrum(g),
         "histograms": {"lateness": _histogram(g.lateness), "compute": _histogram(g.compute)},
         "bus": {name: [_r(t), _r(load)] for name, (t, load) in g.bus.items() if len(t)},
