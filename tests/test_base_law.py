@@ -266,7 +266,7 @@ def test_faults_of_the_machine_are_seen_in_the_tick_that_has_them(name, feedback
         assert name not in faults.names(m.in_force)
         m, command, _ = pipe.tick(BASE, m, healthy(slot=k, **feedback), Request())
     assert name in faults.names(m.in_force)
-    severe = faults.FAULTS[faults.INDEX[name]].severity
+    severe = faults.TABLE.by_name[name].severity
     assert (m.state == State.SAFE_STOP) == (severe >= faults.Severity.SS2)
     assert math.isfinite(command.v)
     assert math.isfinite(command.w)

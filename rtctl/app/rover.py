@@ -100,7 +100,7 @@ def _news(before: BaseMemory, after: BaseMemory) -> list[tuple[str, str]]:
         found.append(("rejected", after.verdict))
     fresh = after.in_force & ~before.in_force
     if fresh:
-        found.append(("fault", faults.describe(fresh, after.state) + _numbers(fresh, after)))
+        found.append(("fault", faults.TABLE.describe(fresh, after.state) + _numbers(fresh, after)))
     if after.state != before.state:
         found.append(("state", after.state.name))
     if (after.status, after.blocker) != (before.status, before.blocker) and after.status != Status.NO_GOAL:
