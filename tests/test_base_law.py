@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from firmware_sim.vehicle import Traits, Vehicle
 from rtctl.app.replay import replay
-from rtctl.app.rover import header_of
+from rtctl.app.rover_log import header_of
 from rtctl.design.rover import build
 from rtctl.errors import LogError
 from rtctl.log import read

@@ -30,6 +30,7 @@ ROVER = ROOT / "configs" / "rover.toml"
 WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}  # [s] that an autopilot's own avoidance needed
 CLEARANCE = 0.6  # [m] clearance_m of the config
 NEAR = 2.0  # [m] of the goal, where the clock stops
+SPARE = 5.0  # [s] beyond what the autopilot needed, for a run to end in
 HEADING = math.radians(60.0)
 EXPLAINED = ("blind", "shadowed", "local_minimum", "arrived")
 SIGHT_DURATION, SIGHT_START = 16.0, 4.0  # [s], [m] nearer to what stands in the way
@@ -70,7 +71,8 @@ def worlds(seeds: int) -> Iterator[Case]:
     for name in WORLDS:
         for seed in range(seeds):
             heading = float(np.random.default_rng([1, seed]).uniform(-HEADING, HEADING))
-            yield Case("worlds", name, replaced(of_world(name), seed=seed, start_pose=(0.0, 0.0, heading)))
+            play = replaced(of_world(name), seed=seed, start_pose=(0.0, 0.0, heading), duration_s=WORLDS[name] + SPARE)
+            yield Case("worlds", name, play)
 
 
 def sight(runs: int) -> Iterator[Case]:
