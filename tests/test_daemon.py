@@ -104,7 +104,8 @@ class TestSession:
         second = idle.launch()
         assert second.wait() == EXIT_CONFIG
         first = next(p for p in idle.started if "rtctl: ready" in p.text)
-        assert f"in use by process {first.popen.pid}, wanted one rtctl per bus" in one_line(second)
+        assert f"in use by process {first.popen.pid} of user " in one_line(second)
+        assert "wanted one rtctl per bus" in one_line(second)
         assert idle.status()["faults"] == []
 
 
