@@ -7,7 +7,8 @@ import numpy as np
 
 from firmware_sim import plane
 from firmware_sim.rover import Rover, open_rover
-from rtctl.app.rover import machine_of, open_link
+from rtctl.app.rover import ROVER as VEHICLE
+from rtctl.app.rover_link import open_link
 from rtctl.app.servo import Servo
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
@@ -41,10 +42,8 @@ class BaseLab:
         self.relay = relay
         self.sent: list[bytes] = []  # of the last period
         self.link = open_link(self.config, Path(config), InProcess(self._exchange, self.base.dt))
-        self.start = self.link.handshake()
-        machine = machine_of(self.link)
-        self.servo = Servo(self.base, self.link, sink, np.zeros(0), stamp=lambda now: round(now * 1e9),
-                           machine=machine, start=self.start)  # fmt: skip
+        self.start = self.link.greet(lockstep=True)
+        self.servo = Servo(VEHICLE, self.base, self.link, sink, self.start, stamp=lambda now: round(now * 1e9))
         self.slot = 0
         self.asks: list[Ask] = []
         self.least = np.inf

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from firmware_sim.simulator import open_simulator
 from rtctl import design as cfg
-from rtctl.app.arm import link_spec
-from rtctl.app.servo import Servo, Turn, first_feedback
-from rtctl.app.sim import Feed, Tally, simulate
+from rtctl.app.arm import ARM
+from rtctl.app.arm_link import ArmLink, first_feedback, link_spec
+from rtctl.app.arm_scene import ArmFeed, ArmTally, ArmTurn
+from rtctl.app.servo import Servo
+from rtctl.app.sim import simulate
 from rtctl.arm import faults
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial, tick
 from rtctl.arm.robot import Robot
-from rtctl.hal.can.handshake import handshake
-from rtctl.hal.can.link import CanLink
 from rtctl.hal.can.transport import InProcess
 from rtctl.hal.clock import Slot
 from rtctl.kernel.rotations import quat_of
@@ -100,11 +100,11 @@ def play(scenario: dict[str, Any], path: Path = PANDA) -> Run:
     play_of: Scenario = convert({"robot": "panda", **scenario}, Scenario, "scenario")
     arm = robot(path)
     with lab(path=path, scenario=scenario_dict(play_of)) as here:
-        tally = Tally(arm)
-        feed = Feed(arm, play_of, here.simulator, tally)
+        tally = ArmTally(arm)
+        feed = ArmFeed(arm, play_of, here.simulator, tally)
         truths: list[Truth] = []
         while here.simulator.time < play_of.duration_s:
-            turn = here.step(feed.request(here.servo, here.simulator.truth()))
+            turn = here.step(feed.request(here.memory, here.simulator.truth()))
             truths.append(here.simulator.truth())
             tally.add(truths[-1], turn)
         return Run(
@@ -128,11 +128,10 @@ class Lab:
     def __init__(self, path: Path, simulator: Any) -> None:
         """`simulator` is firmware_sim's; rtctl knows it by its protocol alone."""
         self.robot, self.simulator = robot(path), simulator
-        self.link = CanLink(link_spec(cfg.load(path)), InProcess.of(self.simulator))
-        greeting = handshake(self.link, listen=0.0, recover=True)
-        self.servo = Servo(self.robot, self.link, None, greeting.q)
-        self.first = first_feedback(greeting.q)
-        self.turns: list[Turn] = []
+        self.link = ArmLink(link_spec(cfg.load(path)), InProcess.of(self.simulator))
+        self.first = self.link.greet(lockstep=True)
+        self.servo = Servo(ARM, self.robot, self.link, None, self.first)
+        self.turns: list[ArmTurn] = []
         self.requests: list[Request] = []
         self.slot = 0
 
@@ -141,7 +140,7 @@ class Lab:
         """What the last tick left."""
         return self.servo.memory
 
-    def step(self, request: Request = Request(), missed: int = 0) -> Turn:  # noqa: B008 - a frozen value
+    def step(self, request: Request = Request(), missed: int = 0) -> ArmTurn:  # noqa: B008 - a frozen value
         """Play one slot, after `missed` ones in which nothing was sent."""
         for _ in range(missed):
             self.simulator.advance()
@@ -171,7 +170,7 @@ class Lab:
         self.until(State.RUN)
         return self
 
-    def ask(self, position: Sequence[float] | F64, wxyz: F64 | None = None) -> Turn:
+    def ask(self, position: Sequence[float] | F64, wxyz: F64 | None = None) -> ArmTurn:
         """Give a goal."""
         return self.step(Request(goal=goal(self.memory, position, wxyz)))
 

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from firmware_sim.vehicle import Traits, Vehicle
 from rtctl.app.replay import replay
-from rtctl.app.rover import header_of
+from rtctl.app.rover_log import header_of
 from rtctl.design.rover import build
 from rtctl.errors import LogError
 from rtctl.log import read
@@ -280,7 +280,7 @@ def test_faults_of_the_machine_are_seen_in_the_tick_that_has_them(name, feedback
         assert name not in faults.names(m.in_force)
         m, command, _ = pipe.tick(BASE, m, healthy(slot=k, **feedback), Request())
     assert name in faults.names(m.in_force)
-    severe = faults.FAULTS[faults.INDEX[name]].severity
+    severe = faults.TABLE.by_name[name].severity
     assert (m.state == State.SAFE_STOP) == (severe >= faults.Severity.SS2)
     assert math.isfinite(command.v)
     assert math.isfinite(command.w)

@@ -19,7 +19,7 @@ from pamoja import mavlink as pamoja
 
 from firmware_sim import rover
 from firmware_sim.rover_serve import open_port
-from rtctl.app.rover import open_link
+from rtctl.app.rover_link import open_link
 from rtctl.errors import EXIT_FAILED, AbsentError, HandshakeError, LinkError, StoppedError
 from rtctl.hal.mavlink.link import dialect
 from rtctl.hal.mavlink.talk import Order, Talk, Word, stream
@@ -503,7 +503,7 @@ def test_all_bytes_are_in_the_log_and_pymavlinks_own_reader_takes_the_tlog(tmp_p
         (sent if way == "up" else received).extend(packets)
         return packets
 
-    from rtctl.app.rover import header_of
+    from rtctl.app.rover_log import header_of
 
     probe = BaseLab()
     sink = McapSink(tmp_path / "run.mcap", header_of(probe.config, Path(ROVER), probe.base, probe.start))

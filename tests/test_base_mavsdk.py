@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("mavsdk")
 
-from rtctl.app.rover import machine_of, open_link
+from rtctl.app.rover import ROVER as VEHICLE
+from rtctl.app.rover_link import open_link
 from rtctl.app.servo import Servo
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
@@ -45,7 +45,7 @@ def driven(config: Path, vehicle: MavsdkVehicle) -> tuple[Any, Any]:
     warm(base)  # the vehicle lives by the wall clock: nothing may compile while it is not heard
     link: Any = open_link(checked, config, Wall(vehicle.exchange, 0.02))
     start = link.handshake()
-    servo = Servo(base, link, None, np.zeros(0), machine=machine_of(link), start=start)
+    servo = Servo(VEHICLE, base, link, None, start)
     link.settle()
     slots = iter(range(1 << 30))
 

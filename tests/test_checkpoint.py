@@ -12,6 +12,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from rtctl import design as cfg
+from rtctl.app import arm as arm_vehicle
+from rtctl.app import arm_log
 from rtctl.app import replay as module
 from rtctl.app.replay import Replay, replay
 from rtctl.arm.escape import Escape, Phase
@@ -71,7 +73,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def built(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare the building of the robot."""
-    monkeypatch.setattr(module, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
+    monkeypatch.setattr(arm_log, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
     monkeypatch.setattr(module.os, "sched_getaffinity", lambda pid: {0, 1, 2})
 
 
@@ -168,7 +170,7 @@ def test_spans_side_by_side_give_what_one_replay_in_order_gives(log: Path):
 @pytest.mark.usefixtures("built")
 @pytest.mark.parametrize("at", [100, 899, 900, 1290])
 def test_a_change_of_the_law_is_found_wherever_it_is(log: Path, monkeypatch: pytest.MonkeyPatch, at: int):
-    law_tick = module.tick
+    law_tick = arm_vehicle.tick
 
     def nudged(arm: Any, memory: Any, *given: Any) -> Any:
         memory, command, record = law_tick(arm, memory, *given)
@@ -176,7 +178,7 @@ def test_a_change_of_the_law_is_found_wherever_it_is(log: Path, monkeypatch: pyt
             memory = memory._replace(joints=memory.joints._replace(q=memory.joints.q + 1e-12))
         return memory, command, record
 
-    monkeypatch.setattr(module, "tick", nudged)
+    monkeypatch.setattr(arm_vehicle, "tick", nudged)
     done = replay(read_run(log))
     assert done.divergence is not None
     assert done.divergence.tick == at + 1

@@ -104,7 +104,8 @@ class TestSession:
         second = idle.launch()
         assert second.wait() == EXIT_CONFIG
         first = next(p for p in idle.started if "rtctl: ready" in p.text)
-        assert f"in use by process {first.popen.pid}, wanted one rtctl per bus" in one_line(second)
+        assert f"in use by process {first.popen.pid} of user " in one_line(second)
+        assert "wanted one rtctl per bus" in one_line(second)
         assert idle.status()["faults"] == []
 
 
@@ -214,20 +215,20 @@ def test_a_tick_that_raises_ends_in_a_damped_stop_with_the_drives_disabled(tmp_p
     script = """
 import sys, time, traceback
 from rtctl import cli
-from rtctl.app import servo
+from rtctl.app import arm
 told = traceback.TracebackException.__init__
 def slowly(*args, **options):
     time.sleep(1.5)  # sources on a slow disk: longer than the drives wait
     told(*args, **options)
 traceback.TracebackException.__init__ = slowly
-tick, count = servo.tick, 0
+tick, count = arm.tick, 0
 def raising(robot, memory, feedback, request):
     global count
     count += memory.goal is not None
     if count > 300:
         raise ZeroDivisionError("injected")
     return tick(robot, memory, feedback, request)
-servo.tick = raising
+arm.tick = raising
 sys.exit(cli.main(sys.argv[1:]))
 """
     with Rig(tmp_path) as rig:

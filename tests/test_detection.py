@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.app.servo import Turn
+from rtctl.app.arm_scene import ArmTurn
 from rtctl.arm import faults
 from rtctl.arm.law import prepared
 from rtctl.types import F64, Link, Request, State, Verb
@@ -15,7 +15,7 @@ JOINT = 1  # carries the arm's weight
 WARNED = Link.DERATED
 
 
-def broken(inject: str, seconds: float, reach: list[float] | None = None) -> tuple[set[str], float, list[Turn], F64]:
+def broken(inject: str, seconds: float, reach: list[float] | None = None) -> tuple[set[str], float, list[ArmTurn], F64]:
     """Return the faults, when [s] after 1 s the arm left RUN (-1: never), all turns and qd at the end."""
     with lab(inject=(inject,) if inject else ()) as here:
         here.running()

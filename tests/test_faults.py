@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rtctl.arm import faults
-from rtctl.arm.faults import BIT, FAULTS, INDEX, describe, latch
+from rtctl.arm.faults import BIT, FAULTS, TABLE, describe
 from rtctl.control.faults import GOOD_TICKS, Fault
 from rtctl.types import Command, Drive, Link, ObstacleEdit, Request, Severity, State, Verb
 from tests.arms import PANDA_HOME
@@ -175,7 +174,7 @@ def name(request: pytest.FixtureRequest) -> Any:
 
 def test_the_table_is_the_published_one():
     assert {f.name: (f.severity, f.clear) for f in FAULTS} == DEMANDED
-    assert [INDEX[f.name] for f in FAULTS] == list(range(len(FAULTS)))
+    assert [BIT[f.name] for f in FAULTS] == [1 << i for i in range(len(FAULTS))]
     assert [BIT[f.name] for f in FAULTS] == [1 << i for i in range(len(FAULTS))]
 
 
@@ -268,7 +267,7 @@ def test_some_faults_want_a_restart_of_the_program(lasting: str):
     arm = Arm()
     produced(lasting, arm)
     arm.ticks(20)
-    assert FAULTS[INDEX[lasting]].text in arm.ask(Verb.RESET)
+    assert TABLE.by_name[lasting].text in arm.ask(Verb.RESET)
     assert arm.state() == State.SAFE_STOP
     assert lasting in arm.present
 
@@ -294,7 +293,7 @@ def test_every_fault_that_is_there_refuses_arming_but_a_doubled_reply(name: str)
         assert verdict == ""
         assert arm.state() == State.ARMED
     else:
-        assert FAULTS[INDEX[name]].text in verdict
+        assert TABLE.by_name[name].text in verdict
         assert arm.state() == State.IDLE
 
 
@@ -417,12 +416,12 @@ def test_a_description_names_fault_joint_and_code():
 @pytest.mark.parametrize("each", FAULTS, ids=lambda f: f.name)
 def test_latching_keeps_what_an_operator_must_clear(each: Fault):
     bit = BIT[each.name]
-    in_force, good = latch(bit, 0, np.full(len(FAULTS), 1 << 30))
+    in_force, good = TABLE.latch(bit, 0, np.full(len(FAULTS), 1 << 30))
     assert in_force == bit
     for _ in range(GOOD_TICKS - 1):
-        in_force, good = latch(0, in_force, good)
+        in_force, good = TABLE.latch(0, in_force, good)
         assert in_force == bit
-    in_force, good = latch(0, in_force, good)
+    in_force, good = TABLE.latch(0, in_force, good)
     assert in_force == (0 if each.clear == "A" else bit)
-    assert faults.cleared(bit, 0) == (bit if each.clear == "L" else 0)
-    assert faults.cleared(bit, bit) == bit
+    assert TABLE.cleared(bit, 0) == (bit if each.clear == "L" else 0)
+    assert TABLE.cleared(bit, bit) == bit

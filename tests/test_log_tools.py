@@ -23,8 +23,10 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 from rosbags.typesys import Stores, get_typestore
 
 from rtctl import design as cfg
-from rtctl.app import compare
-from rtctl.app.replay import rebuilt, replay
+from rtctl.app import arm as arm_vehicle
+from rtctl.app import arm_log, compare
+from rtctl.app.arm_log import rebuilt
+from rtctl.app.replay import replay
 from rtctl.app.sim import simulate
 from rtctl.arm.record import record_dtype
 from rtctl.cli import main
@@ -102,8 +104,6 @@ def test_the_control_law_has_not_changed_a_bit(name: str):
 
 
 def test_a_changed_bit_is_reported_as_tick_joint_field_and_size(log: Path, monkeypatch: pytest.MonkeyPatch):
-    from rtctl.app import replay as module
-
     def nudged(arm: Any, memory: Any, feedback: Any, request: Any) -> Any:
         memory, command, record = law_tick(arm, memory, feedback, request)
         if memory.tick == 700:
@@ -111,9 +111,9 @@ def test_a_changed_bit_is_reported_as_tick_joint_field_and_size(log: Path, monke
             record["tau_wanted"][0, 3] = np.nextafter(record["tau_wanted"][0, 3], np.inf)
         return memory, command, record
 
-    law_tick = module.tick
-    monkeypatch.setattr(module, "tick", nudged)
-    monkeypatch.setattr(module, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
+    law_tick = arm_vehicle.tick
+    monkeypatch.setattr(arm_vehicle, "tick", nudged)
+    monkeypatch.setattr(arm_log, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
     done = replay(read_run(log))
     assert done.divergence is not None
     assert (done.divergence.tick, done.divergence.joint, done.divergence.field) == (700, "panda_joint4", "tau_wanted")
@@ -126,9 +126,7 @@ def test_a_changed_bit_is_reported_as_tick_joint_field_and_size(log: Path, monke
 
 
 def test_a_changed_command_byte_is_found_on_the_wire(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from rtctl.app import replay as module
-
-    monkeypatch.setattr(module, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
+    monkeypatch.setattr(arm_log, "rebuilt", lambda run: (cfg.load(PANDA), robot()))
     run = read_run(log)
     original = compare._sent_frames
 

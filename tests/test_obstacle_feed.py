@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from firmware_sim import camera as simulated
 from firmware_sim.simulator import open_simulator
 from rtctl import design as cfg
-from rtctl.app.servo import first_feedback
+from rtctl.app.arm_link import first_feedback
 from rtctl.app.sim import simulate
 from rtctl.arm.law import prepared
 from rtctl.arm.pipe import initial, tick

@@ -15,7 +15,7 @@ import pytest
 from msgspec.structs import astuple
 
 from rtctl import design as cfg
-from rtctl.app.servo import first_feedback
+from rtctl.app.arm_link import first_feedback
 from rtctl.app.sim import simulate
 from rtctl.arm.law import prepared
 from rtctl.arm.memory import Memory

@@ -7,8 +7,9 @@ import pytest
 
 from rtctl.arm import session
 from rtctl.arm.law import prepared
-from rtctl.arm.session import EVENT_OF, SETTLE
+from rtctl.arm.session import SETTLE
 from rtctl.control import supervisor
+from rtctl.control.supervisor import EVENT_OF
 from rtctl.types import Drive, ObstacleEdit, Request, Severity, State, Task, Verb
 from tests.arms import PANDA_HOME
 from tests.lab import Standing, goal, robot, sphere

@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from firmware_sim.drive import State as DriveState
 from firmware_sim.inject import KINDS, Fault
 from firmware_sim.simulator import open_simulator
-from rtctl.arm.faults import FAULTS, severity, stops
+from rtctl.arm.faults import FAULTS, TABLE, severity
 from rtctl.protocol import frame
 from rtctl.types import Command, Drive, Goal, Link, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
 from tests.lab import PANDA, Lab, robot
@@ -107,7 +107,7 @@ class Session(RuleBasedStateMachine):
                 assert memory.reaction >= before.reaction
                 if before.off:
                     assert memory.off or memory.state == State.FAULT
-        worst = stops(memory.in_force)
+        worst = TABLE.stops(memory.in_force)
         if worst >= Severity.SS2 and memory.state in (State.ARMED, State.RUN):
             raise AssertionError(f"driven with {worst.name} in force")
         if before.state not in (State.ARMED, State.RUN) and memory.state == State.ARMED:

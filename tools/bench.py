@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from rtctl.app.servo import first_feedback
+from rtctl.app.arm_link import first_feedback
 from rtctl.arm import pipe
 from rtctl.arm.law import evaluate_law
 from rtctl.arm.osc import operational_space

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from rtctl import design as cfg
-from rtctl.app.arm import header_of
-from rtctl.app.replay import rebuilt
+from rtctl.app.arm import ARM
+from rtctl.app.arm_link import ArmLink, first_feedback
+from rtctl.app.arm_log import header_of, rebuilt
 from rtctl.app.servo import Servo
 from rtctl.app.sim import simulate
 from rtctl.hal import clock
-from rtctl.hal.can.link import CanLink
 from rtctl.log import read
 from rtctl.log.mcap.rows import Encoded
 from rtctl.log.mcap.segment import begin
@@ -65,7 +65,7 @@ def _recording(folder: Path, seconds: float) -> tuple[Path, list[Row]]:
     turn, late, logged = np.empty(count), np.empty(count), np.arange(count) // BLOCK % 2 == 1
     with closing(Bus(spec)) as bus, urgent() as policy:
         arm = Arm(robot)
-        servo = Servo(robot, CanLink(spec, bus.transport), None, arm.q)
+        servo = Servo(ARM, robot, ArmLink(spec, bus.transport), None, first_feedback(arm.q))
         servo.link.write(Command(Drive.DISABLE, np.zeros(robot.n)))
         for k, slot in zip(range(count), clock.grid(robot.dt)):  # noqa: B905 the grid has no end
             bus.answer(arm.feedback())

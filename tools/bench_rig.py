@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rtctl import design as cfg
-from rtctl.app.arm import link_spec
+from rtctl.app.arm_link import link_spec
 from rtctl.arm import guards, osc
 from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model

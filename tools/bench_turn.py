@@ -10,7 +10,9 @@ from contextlib import ExitStack, closing, contextmanager
 
 import numpy as np
 
-from rtctl.app.servo import CAN_RX, TICK, Servo, first_feedback
+from rtctl.app.arm import ARM, CAN_RX
+from rtctl.app.arm_link import ArmLink, first_feedback
+from rtctl.app.servo import TICK, Servo
 from rtctl.arm.pipe import initial, tick
 from rtctl.arm.robot import Robot
 from rtctl.hal import clock
@@ -27,7 +29,7 @@ def turns(robot: Robot, spec: LinkSpec, count: int) -> Iterator[Row]:
         bus = stack.enter_context(closing(Bus(spec)))
         record = stack.enter_context(_ring())
         arm = Arm(robot)
-        servo = Servo(robot, CanLink(spec, bus.transport), record, arm.q)
+        servo = Servo(ARM, robot, ArmLink(spec, bus.transport), record, first_feedback(arm.q))
         servo.link.write(Command(Drive.DISABLE, np.zeros(robot.n)))
         ns, due = np.empty(count, np.int64), np.zeros(count, np.bool_)
         policy = stack.enter_context(urgent())

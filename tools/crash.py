@@ -28,12 +28,14 @@ import numpy as np
 from mcap.reader import make_reader
 
 from rtctl import design as cfg
-from rtctl.app.arm import header_of
+from rtctl.app.arm import ARM
+from rtctl.app.arm_link import ArmLink, first_feedback
+from rtctl.app.arm_log import header_of
+from rtctl.app.arm_scene import ArmTurn
 from rtctl.app.daemon import _review
-from rtctl.app.servo import Servo, Turn
+from rtctl.app.servo import Servo
 from rtctl.arm.pipe import warm
 from rtctl.hal import clock
-from rtctl.hal.can.link import CanLink
 from rtctl.log import read
 from rtctl.log.record import ring as rings
 from rtctl.log.record.recorder import Recorder, rescue
@@ -55,11 +57,11 @@ class Rig:
         self.bus, self.arm = Bus(spec), Arm(robot)
         header = header_of(cfg.load(CONFIG), CONFIG, robot, self.arm.q)
         self.recorder = Recorder.start(folder, header, **options)
-        self.servo = Servo(robot, CanLink(spec, self.bus.transport), self.recorder, self.arm.q)
+        self.servo = Servo(ARM, robot, ArmLink(spec, self.bus.transport), self.recorder, first_feedback(self.arm.q))
         self.servo.link.write(Command(Drive.DISABLE, np.zeros(robot.n)))
         self._slot = 0
 
-    def turn(self, asked: Request | None = None) -> Turn:
+    def turn(self, asked: Request | None = None) -> ArmTurn:
         """Take one turn."""
         self.bus.answer(self.arm.feedback())
         k = self._slot

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-
 from rtctl.app.rover_sim import simulate_base
+
 from rtctl.errors import RtctlError
 from rtctl.spec.scenario import FaultTable, Scenario, TimedGoal, load_scenario
 

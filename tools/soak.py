@@ -13,12 +13,13 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from firmware_sim.rover import open_rover
-from rtctl.app.rover import machine_of, open_link
+from rtctl.app.rover import ROVER
+from rtctl.app.rover_link import open_link
 from rtctl.app.servo import Servo
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
@@ -74,9 +75,7 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
     rover = open_rover(config_file, {"obstacle": [DISC]}, wait=True)
     link = open_link(config, config_file, InProcess(rover.exchange, base.dt))
     start = link.handshake()
-    robot: Any = base
-    wires: Any = link
-    servo = Servo(robot, wires, None, np.zeros(0), stamp=lambda now: 0, machine=machine_of(link), start=start)
+    servo = Servo(ROVER, base, link, None, start, stamp=lambda now: 0)
     samples: list[Sample] = []
     ticks, every = round(60.0 * minutes / base.dt), round(STEP / base.dt)
     sent = goals = 0
@@ -84,7 +83,7 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
     gc.collect()
     begun = time.monotonic()
     for slot in range(ticks):
-        m: Any = servo.memory
+        m = servo.memory
         verb = Verb.ARM if slot == 0 else Verb.NONE
         goal = None
         if m.state == State.RUN and (m.goal is None or m.status == Status.ARRIVED):

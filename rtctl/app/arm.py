@@ -1,77 +1,168 @@
-"""From a checked config to the parts that the daemon and the simulation put together."""
+"""The arm as a vehicle: what the loop around its tick, the daemon, the simulation and replay need of it."""
 
-import json
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
+import msgspec
 import numpy as np
 
+from rtctl import design as cfg
+from rtctl.app.arm_link import ArmLink, link_spec, open_link
+from rtctl.app.arm_log import decoded, header_of, rebuild
+from rtctl.app.arm_scene import ArmPlay, scenario_robot
+from rtctl.app.servo import Servo
+from rtctl.app.simulator import open_simulator
+from rtctl.app.vehicle import (
+    LOCKSTEP_SILENT,
+    LOCKSTEP_WAIT,
+    Checkpoints,
+    Event,
+    Json,
+    Link,
+    Said,
+    Setup,
+    Sink,
+    Vehicle,
+    clearances,
+)
+from rtctl.arm import faults, task
+from rtctl.arm.limits import permit, slew_reference
+from rtctl.arm.memory import Memory
+from rtctl.arm.pipe import initial, tick, warm
 from rtctl.arm.robot import Robot
-from rtctl.design import Config, scales
-from rtctl.design.assets import files_named
-from rtctl.hal.can.link import JointSpec, LinkSpec
-from rtctl.kernel.rotations import R_of, quat_of
-from rtctl.log.header import SCENE_FILE, Header, make_header, meshes_to_files, scene_text
-from rtctl.log.record.meshes import MESHES, archive
-from rtctl.protocol import mit
-from rtctl.protocol.dbc import DBC, dbc_of
-from rtctl.protocol.dbc import Joint as DbcJoint
-from rtctl.spec.obstacles import quaternion
-from rtctl.spec.urdf import package_folders, urdf_file
-from rtctl.types import F64
+from rtctl.hal.can.transport import InProcess
+from rtctl.hal.clock import Slot
+from rtctl.hal.messages import Bounds
+from rtctl.hal.service import bus_resource
+from rtctl.kernel.rotations import quat_of
+from rtctl.log.entry import Kind
+from rtctl.log.record.checkpoint import encode_checkpoint
+from rtctl.spec.scenario import Scenario
+from rtctl.types import Command, Drive, Feedback, Status, Task
+
+ArmServo: TypeAlias = Servo[Robot, Memory, Feedback, Command]
+Bus: TypeAlias = Link[Feedback, Command]
+CAN_TX, CAN_RX = int(Kind.CAN_TX), int(Kind.CAN_RX)
+REST_SPEED, REST_TIME = 0.03, 0.1  # [rad/s], [s] all joints below it: the arm rests
 
 
-def link_spec(config: Config) -> LinkSpec:
-    """Return what the link needs to know."""
-    joints = tuple(
-        JointSpec(j.name, j.can_id, scale, j.q_min_rad, j.q_max_rad)
-        for j, scale in zip(config.robot.joints, scales(config), strict=True)
+def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedback, Command]:
+    """Return what an arm's file says; timeout [s] for its drives in place of the file's. Raises ConfigError."""
+    config = cfg.load(path)
+    if timeout is not None:
+        config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, handshake_s=timeout))
+
+    def simulate(scenario: Scenario, source: Path) -> ArmPlay:
+        robot = scenario_robot(cfg.build(config, path), scenario, source)
+        simulator = open_simulator(path, scenario, source)
+        return ArmPlay(robot, scenario, simulator, ArmLink(link_spec(config), InProcess.of(simulator)))
+
+    return Setup(
+        loop=config.loop,
+        console=config.console,
+        log=config.log,
+        resource=(bus_resource(config.link.interface, config.link.channel), "link.channel"),
+        place=f"{config.link.interface}:{config.link.channel}",
+        build=lambda: cfg.build(config, path),
+        open=lambda: open_link(config, path),
+        header=lambda robot, start, link: header_of(config, path, robot, start.q, counters=link.counters),
+        simulate=simulate,
     )
-    return LinkSpec(
-        place=config.link.channel,
-        joints=joints,
-        protocol=config.link.protocol,
-        fd=config.link.fd,
-        period=1.0 / config.loop.servo_hz,
-        watchdog=1e-3 * config.safety.watchdog_ms,
-    )
 
 
-def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[int, ...] = (), **extra: str) -> Header:
-    """Return the header of a log: what replay needs beside the ticks, `q` (n,) [rad] of the handshake included.
+def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> list[Event]:
+    """Return what changed in this tick, as (name, detail): states, faults, statuses, refusals."""
+    found = []
+    if after.verdict:
+        found.append(("rejected", after.verdict))
+    fresh = after.in_force & ~before.in_force
+    if fresh:
+        found.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
+    if after.state != before.state:
+        found.append(("state", after.state.name))
+    if (after.status, after.holders) != (before.status, before.holders) and after.status != Status.NO_GOAL:
+        found.append((after.status.name.lower(), "; ".join(after.held)))
+    return found
 
-    counters: of the link after the handshake.
+
+def errors(m: Memory) -> tuple[float | None, float | None]:
+    """Return the distance [m] and the angle [rad] to the goal, None for what it leaves free."""
+    if m.goal is None:
+        return None, None
+    error, error_rot = task.error_of(m.goal, m.tip.x, m.tip.R)
+    return error if m.goal.task & Task.POSITION else None, error_rot if task.turns(m.goal.task) else None
+
+
+def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
+    """Return what `rtctl status` shows of an arm."""
+    goal, (error, error_rot) = m.goal, errors(m)
+    return {
+        "detail": "; ".join(m.held),
+        "q_rad": m.joints.q,
+        "x_m": m.tip.x,
+        "wxyz": quat_of(m.tip.R),
+        "speed_m_s": float(np.linalg.norm(m.tip.xd)),
+        "goal_m": None if goal is None else goal.position,
+        "task": None if goal is None else task.names(goal.task),
+        "error_m": error,
+        "error_rad": error_rot,
+        "clearance_m": clearances(m),
+        "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
+    }
+
+
+def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slot], lockstep: bool) -> None:
+    """A turn raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
+
+    -D qd + g through the permitter, from the feedback alone: nothing of the tick that failed is used.
     """
-    urdf = urdf_file(config.robot.urdf, path)
-    text = urdf.read_text(encoding="utf-8")
-    files: dict[str, str | bytes] = {SCENE_FILE: scene_of(config, robot), DBC: drive_dbc(config)}
-    files |= meshes_to_files(robot.meshes)
-    if meshes := archive(text, urdf.parent, package_folders(urdf), files_named(config), path.resolve().parent):
-        files[MESHES] = meshes
-    return make_header(
-        robot.name,
-        robot.joints,
-        robot.slots,
-        robot.dt,
-        config=path.read_text(encoding="utf-8"),
-        urdf=text,
-        extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
-        files=files,
-    )
+    g, sent, rest, driven, heard = m.model.g, m.sent[0], 0, True, True
+    for k, slot in enumerate(slots):
+        feedback = link.read(slot.slot, slot.missed, slot.lateness, 0.0)
+        sink.put_many(CAN_RX, link.received, time.monotonic_ns())
+        driven = bool((feedback.drive == 1).all()) if k == 0 else driven
+        rest = rest + 1 if bool((np.abs(feedback.qd) < REST_SPEED).all()) else 0
+        if not driven or rest * robot.dt > REST_TIME or k * robot.dt > robot.stop.time:
+            return
+        keep = g - robot.stop.damping * feedback.qd
+        reference = slew_reference(sent, feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, 1)
+        sent = permit(
+            np.zeros(robot.n), keep, feedback.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt
+        ).tau
+        sink.put_many(CAN_TX, link.write(Command(Drive.TORQUE, sent)), time.monotonic_ns())
+        if lockstep:
+            heard = link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
 
 
-def drive_dbc(config: Config) -> str:
-    """Return the DBC of the robot's own identifiers and scales."""
-    joints = [DbcJoint(j.name, j.can_id, *scale) for j, scale in zip(config.robot.joints, scales(config), strict=True)]
-    return dbc_of(joints, config.link.protocol == "mit+e2e", mit.REPLY_OFFSET, mit.KP_MAX, mit.KD_MAX)
+def farewell(robot: Robot, m: Memory, link: Bus, sink: Sink) -> None:
+    """Send disable frames until the drives have surely heard one."""
+    for _ in range(robot.stop.frames):
+        sink.put_many(CAN_TX, link.write(Command(Drive.DISABLE, np.zeros(robot.n))), time.monotonic_ns())
+        time.sleep(robot.dt)
+        link.read(-1, 0, 0.0, 0.0)
+        sink.put_many(CAN_RX, link.received, time.monotonic_ns())
 
 
-def scene_of(config: Config, robot: Robot) -> str:
-    """Return as JSON what the recorder needs to draw the arm and its obstacles without knowing the robot."""
-    base = config.robot.base_pose
-    wxyz = quat_of(R_of(quaternion(base.rpy_rad, base.wxyz)))
-    at = zip(robot.points.link, robot.points.local.tolist(), robot.points.radius.tolist(), strict=True)
-    return scene_text(
-        [[int(link), *p, radius] for link, p, radius in at],
-        robot.obstacles,
-        base={"position": list(base.position_m), "wxyz": wxyz.tolist()},
-    )
+ARM = Vehicle(
+    rx=CAN_RX,
+    tx=CAN_TX,
+    load=load,
+    warm=warm,
+    bounds=lambda robot, link: Bounds(
+        tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
+    ),
+    initial=initial,
+    tick=lambda robot, memory, feedback, request: tick(robot, memory, feedback, request),  # looked up when called
+    flagged=lambda feedback, flags: feedback._replace(link=feedback.link | flags),
+    harmless=lambda command: command._replace(drive=Drive.DISABLE),
+    events=events,
+    names=faults.names,
+    status=status,
+    fallback=fallback,
+    farewell=farewell,
+    rebuild=rebuild,
+    checkpoints=Checkpoints(encode_checkpoint, decoded),
+    keeps_step=True,
+)

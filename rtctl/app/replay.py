@@ -7,38 +7,25 @@ import gc
 import hashlib
 import multiprocessing
 import os
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, Generic, NamedTuple, TypeAlias
 
-import msgspec
 import numpy as np
 
-from rtctl import design as cfg
-from rtctl.app.arm import link_spec
+from rtctl.app.choose import vehicle_named
 from rtctl.app.compare import Check, Difference, Divergence, Wire
-from rtctl.app.servo import first_feedback
-from rtctl.arm.pipe import initial, tick
-from rtctl.arm.robot import Robot
-from rtctl.design import Config
-from rtctl.errors import ConfigError, LogError
-from rtctl.hal.can.link import CanLink
+from rtctl.app.vehicle import C, F, M, R, Rebuilt, Vehicle
+from rtctl.errors import LogError
 from rtctl.log import schema
-from rtctl.log.header import meshes_of
 from rtctl.log.mcap.walk import I64_MAX
-from rtctl.log.read.inputs import EVERYTHING, Logged, feedbacks_of, inputs
+from rtctl.log.read.inputs import EVERYTHING, Logged, inputs
 from rtctl.log.read.run import Run
-from rtctl.log.read.topic import Structured
-from rtctl.log.record.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
-from rtctl.log.record.meshes import unpacked
-from rtctl.spec.urdf import urdf_file
-from rtctl.types import F64, Command, Drive, Request, Transport
+from rtctl.types import F64
 
 BLOCK = 1000  # ticks that are compared at once
 
@@ -70,92 +57,38 @@ class Replay(NamedTuple):
         return self.duration / self.seconds if self.seconds > 0.0 else 0.0
 
 
-def rebuilt(run: Run) -> tuple[Config, Robot]:
-    """Return config and robot as the log's attachments describe them.
+class _Subject(NamedTuple, Generic[R, M, F, C]):
+    """What is replayed."""
 
-    Raises LogError when they are not there, ConfigError when this version refuses them.
-    """
-    header = run.header
-    if not header.config or not header.urdf:
-        raise LogError(f"{run.path}: no config.toml or robot.urdf attached: it cannot be replayed alone")
-    with tempfile.TemporaryDirectory(prefix="rtctl-replay-") as name:
-        folder = Path(name)
-        urdf, text = unpacked(header.urdf, header.config, header.files, folder)
-        (folder / "config.toml").write_text(text, encoding="utf-8")
-        (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
+    vehicle: Vehicle[R, M, F, C]
+    log: Rebuilt[R, F, C]
+    memory: M  # before the first tick
+    dry: bool  # the commands were computed but not sent
+
+    def encoded(self, command: C) -> bytes:
+        """Return the frames of a command, b'' where they cannot be made again."""
+        if self.log.encode is None:
+            return b""
+        return b"".join(self.log.encode(self.vehicle.harmless(command) if self.dry else command))
+
+    def resumed(self, run: Run, mark: "_Mark") -> tuple[M, tuple[int, ...]]:
+        """Return memory and counters of a checkpoint. Raises LogError."""
+        kept = self.vehicle.checkpoints
+        assert kept is not None
         try:
-            config = cfg.load(folder / "config.toml")
-            own = msgspec.structs.replace(config.robot, urdf="robot.urdf")
-            here = msgspec.structs.replace(config, robot=own)
-            robot = cfg.build(here, folder / "config.toml")
-            return config, robot._replace(meshes=meshes_of(header))
+            return kept.decode(mark.text, self.log.robot, self.memory)
         except ValueError as error:
-            raise LogError(f"{run.path}: a mesh that is attached: {error}") from None
-        except ConfigError as error:
-            place = error.place.replace(f"{folder}/", f"{run.path}: ")
-            raise ConfigError(place, error.got, error.wanted) from None
+            raise LogError(f"{run.path}: its checkpoint cannot be used: {error}") from None
+
+    def agrees(self, memory: M, mark: "_Mark | None") -> bool:
+        """Return whether a memory and the counters of now are those of a checkpoint, None for any."""
+        kept, wire = self.vehicle.checkpoints, self.log.wire
+        if mark is None:
+            return True
+        return kept is not None and wire is not None and kept.encode(memory, wire.counters) == mark.text
 
 
-def other(path: Path, run: Run) -> tuple[Config, Robot]:
-    """Return another config and its robot, for what-if. Raises ConfigError when it is not for this log's robot."""
-    config = cfg.load(path)
-    urdf_file(config.robot.urdf, path)
-    header = run.header
-    names = tuple(j.name for j in config.robot.joints)
-    if names != header.joints:
-        raise ConfigError(f"{path}: robot.joints", ", ".join(names), f"the log's {', '.join(header.joints)}")
-    if abs(1.0 / config.loop.servo_hz - header.period) > 1e-12:
-        raise ConfigError(f"{path}: loop.servo_hz", config.loop.servo_hz, f"the log's {1.0 / header.period:g}")
-    return config, cfg.build(config, path)._replace(meshes=meshes_of(run.header))
-
-
-class _Null:
-    """A bus that takes everything."""
-
-    def send_all(self, frames: Sequence[bytes]) -> Sequence[bytes]:
-        return frames
-
-
-class _Subject(NamedTuple):
-    """What is replayed: an arm or a base."""
-
-    name: str
-    dt: float  # [s]
-    memory: Any
-    tick: Callable[[Any, Any, Request], tuple[Any, Any, Any]]  # (memory, feedback, request)
-    feedbacks: Callable[[Structured], Iterable[Any]]
-    link: CanLink | None  # encodes commands again; None: the records alone are compared
-    shown: str  # the field of a command that is drawn
-    robot: Robot | None = None  # of an arm: its memory is kept in checkpoints
-
-
-def _arm(run: Run, config: Path | None) -> _Subject:
-    what, robot = rebuilt(run) if config is None else other(config, run)
-    link = CanLink(link_spec(what), cast(Transport, _Null()))
-    memory = initial(robot, first_feedback(_first_q(run)))
-    return _Subject(robot.name, robot.dt, memory, partial(tick, robot), feedbacks_of, link, "tau_sent", robot)
-
-
-def _base(run: Run, config: Path | None) -> _Subject:
-    from rtctl.design.rover import build
-    from rtctl.rover import pipe
-    from rtctl.rover.record import feedback_from
-    from rtctl.spec.base import load
-
-    header = run.header
-    with tempfile.TemporaryDirectory(prefix="rtctl-replay-") as name:
-        path = Path(name) / "config.toml"
-        path.write_text(unpacked("", header.config, header.files, path.parent)[1], encoding="utf-8")
-        path = path if config is None else config
-        base = build(load(path), path)
-    try:
-        start = feedback_from(np.frombuffer(bytes.fromhex(header.extra.get("start", "")), header.dtype)[0])
-    except (ValueError, IndexError):
-        raise LogError(f"{run.path}: its header has no feedback of the handshake") from None
-    if abs(base.dt - header.period) > 1e-12:
-        raise ConfigError(f"{path}: loop.servo_hz", f"{1.0 / base.dt:g}", f"the log's {1.0 / header.period:g}")
-    step, rows = partial(pipe.tick, base), partial(map, feedback_from)
-    return _Subject(base.name, base.dt, pipe.initial(base, start), step, rows, None, "v_world")
+_Some: TypeAlias = _Subject[Any, Any, Any, Any]  # chosen by the log
 
 
 class _Mark(NamedTuple):
@@ -188,8 +121,11 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     what-if, all is replayed in order. A log that has lost its beginning is replayed from its first checkpoint on.
     progress: called with the number of ticks done. Raises LogError, ConfigError.
     """
-    subject = (_base if run.header.extra.get("kind") == "base" else _arm)(run, config)
-    marks = _marks(run) if subject.robot is not None else []
+    vehicle = vehicle_named(run.header.extra.get("kind", "arm"))
+    log = vehicle.rebuild(run, config)
+    start = vehicle.initial(log.robot, log.start)
+    subject: _Some = _Subject(vehicle, log, start, run.header.extra.get("dry") == "1")
+    marks = _marks(run) if vehicle.checkpoints is not None else []
     begun = time.perf_counter()
     first = _first_tick(run)
     whole = first == 0
@@ -209,8 +145,8 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     seconds, ticks = time.perf_counter() - begun, sum(part.ticks for part in done)
     full = [part for part in done if part.ticks]
     return Replay(
-        subject.name, ticks, sum(part.frames for part in done), "" if subject.link is None else digest.hexdigest(),
-        done[0].divergence, done[0].differences, done[0].ignored, seconds, ticks * subject.dt,
+        log.robot.name, ticks, sum(part.frames for part in done), "" if log.wire is None else digest.hexdigest(),
+        done[0].divergence, done[0].differences, done[0].ignored, seconds, ticks * log.robot.dt,
         *(np.concatenate([getattr(part, name) for part in full]) for name in ("time", "logged", "replayed")),
     )  # fmt: skip
 
@@ -230,7 +166,7 @@ def _marks(run: Run) -> list[_Mark]:
 
 
 def _at_once(
-    run: Run, subject: _Subject, marks: list[_Mark], whole: bool, progress: Callable[[int], None]
+    run: Run, subject: _Some, marks: list[_Mark], whole: bool, progress: Callable[[int], None]
 ) -> list[_Part] | None:
     """Return the spans between the checkpoints, replayed side by side; None unless all of them are as the log says."""
     jobs = min(len(os.sched_getaffinity(0)), len(marks) + whole)
@@ -257,12 +193,12 @@ def _at_once(
     return parts
 
 
-_inherited: tuple[Run, _Subject, list[_Mark | None]]
+_inherited: tuple[Run, _Some, list[_Mark | None]]
 
 
-def _inherit(*given: Any) -> None:
+def _inherit(run: Run, subject: _Some, marks: list[_Mark | None]) -> None:
     global _inherited
-    _inherited = given
+    _inherited = run, subject, marks
 
 
 def _span(k: int) -> _Part | None:
@@ -278,64 +214,43 @@ def _span(k: int) -> _Part | None:
 
 
 def _played(
-    run: Run, subject: _Subject, span: tuple[int, int], begin: _Mark | None, compares: bool,
+    run: Run, subject: _Subject[R, M, F, C], span: tuple[int, int], begin: _Mark | None, compares: bool,
     sent_on: Callable[[bytes], None], progress: Callable[[int], None], end: _Mark | None = None,
 ) -> _Part:  # fmt: skip
     """Replay the ticks of a span of log_time, from a checkpoint or from the very start, up to one or the very end."""
-    link, memory, expected = subject.link, subject.memory, 0
-    dry = run.header.extra.get("dry") == "1"
-    wire = None if link is None else Wire(run, link, compares, span)
+    log, robot, tick, memory, expected = subject.log, subject.log.robot, subject.vehicle.tick, subject.memory, 0
+    wire = None if log.wire is None else Wire(run, log.wire, compares, span)
     if begin is not None:
-        start = _start(run, subject, begin)
-        memory, expected = start.memory, start.memory.tick + 1
+        memory, counters = subject.resumed(run, begin)
+        expected = memory.tick + 1
         if wire is not None:
-            wire.go_on(start.counters)
-    check = Check(run, subject.shown)
+            wire.go_on(counters)
+    check = Check(run, log.shown)
     done = 0
-    for block in _blocks(inputs(run.logs, subject.feedbacks, span)):
+    for block in _blocks(inputs(run.logs, log.feedbacks, span)):
         if not done and int(block[0].record["tick"]) != expected:
             raise LogError(f"{run.path}: goes on with tick {block[0].record['tick']}, wanted {expected}")
         if wire is not None:
             wire.prime(block[0].log_time)
         records, sent = [], []
         for logged in block:
-            memory, command, record = subject.tick(memory, logged.feedback, logged.request)
+            memory, command, record = tick(robot, memory, logged.feedback, logged.request)
             records.append(record)
-            if link is not None:
-                sent.append(b"".join(link.write(Command(Drive.DISABLE, command.tau) if dry else command)))
-                sent_on(sent[-1])
+            sent.append(subject.encoded(command))
+            sent_on(sent[-1])
         ticks = check.compare([logged.record for logged in block], records)
         if wire is not None:
-            wire.compare([logged.log_time for logged in block], ticks, subject.dt, sent)
+            wire.compare([logged.log_time for logged in block], ticks, robot.dt, sent)
         done += len(block)
         progress(done)
     found = (check.divergence, None if wire is None else wire.divergence)
     first = min((d for d in found if d is not None), key=lambda d: d.tick, default=None)
-    agrees = end is None or (link is not None and encode_checkpoint(memory, link.counters) == end.text)
     time, logged_tau, tau = check.drawn()
     frames = 0 if wire is None else wire.frames
+    agrees = subject.agrees(memory, end)
     return _Part(done, frames, first, check.differences(), check.ignored, time, logged_tau, tau, b"", agrees)
-
-
-def _start(run: Run, subject: _Subject, mark: _Mark) -> Checkpoint:
-    assert subject.robot is not None
-    try:
-        return decode_checkpoint(mark.text, subject.robot, subject.memory)
-    except ValueError as error:
-        raise LogError(f"{run.path}: its checkpoint cannot be used: {error}") from None
 
 
 def _blocks(ticks: Iterator[Logged]) -> Iterator[list[Logged]]:
     while block := list(islice(ticks, BLOCK)):
         yield block
-
-
-def _first_q(run: Run) -> F64:
-    text = run.header.extra.get("q_handshake", "")
-    try:
-        q = np.frombuffer(bytes.fromhex(text), np.float64)
-    except ValueError:
-        q = np.zeros(0)
-    if q.shape != (len(run.header.joints),):
-        raise LogError(f"{run.path}: its header has no positions of the handshake")
-    return q

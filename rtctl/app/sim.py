@@ -1,223 +1,51 @@
-"""`rtctl sim`: controller and virtual robot in one process, in lockstep, deterministic.
+"""`rtctl sim`: controller and virtual vehicle in one process, in lockstep, deterministic.
 
-The controller is the daemon's own servo on the same CAN bytes; only the bus is a function call. What is reported comes
+The controller is the daemon's own servo on the same bytes; only the bus is a function call. What is reported comes
 from the simulator's account of the truth, which the controller never sees.
 """
 
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import numpy as np
-
-from rtctl import design as cfg
-from rtctl.app.arm import header_of, link_spec
-from rtctl.app.servo import Servo, Turn
-from rtctl.app.simulator import open_simulator
-from rtctl.app.stream import Follower, Seen
-from rtctl.app.tally import Leg, number, of_way
-from rtctl.arm import faults, task
-from rtctl.arm.memory import Memory
-from rtctl.arm.robot import Robot
-from rtctl.design.assets import load_assets
-from rtctl.errors import ConfigError, PlanError
-from rtctl.hal.can.handshake import handshake
-from rtctl.hal.can.link import CanLink
-from rtctl.hal.can.transport import InProcess
+from rtctl.app.choose import vehicle_of
+from rtctl.app.servo import Servo
+from rtctl.app.tally import number
+from rtctl.app.vehicle import C, F, Json, M, Play, R, Turn
 from rtctl.hal.clock import lockstep
-from rtctl.kernel.rotations import R_of, quat_of
-from rtctl.spec.base import is_base
-from rtctl.spec.scenario import Scenario, goal_of, load_scenario, robot_file
-from rtctl.types import F64, Drive, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
-from rtctl.world import obstacle_table
-from rtctl.world.obstacle_table import World
+from rtctl.spec.scenario import Scenario, load_scenario, robot_file
 
-CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
-Watch = Callable[[Servo, Truth, Turn], None]  # is shown the truth after each period, and what the servo did in it
-ARM_TIME = 2.0  # [s] within which the robot must be running
-SHOWN = frozenset(("state", "fault"))  # events that are no statuses
-
-
-class Tally:
-    """Figures of a run, from the truth of each period."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
-        self.legs: list[Leg] = []
-        self.tip: F64 | None = None
-        self.tau: F64 | None = None
-        self.path = self.speed = 0.0
-        self.torque = self.rate = self.joint_speed = 0.0
-        self.margin = self.own = np.inf
-        self.clearance: dict[str, float] = {}
-        self.contacts = 0
-        self.offset = 0.0  # [s] scenario time less the servo's
-
-    def add(self, truth: Truth, turn: Turn) -> None:
-        """Take one period into account."""
-        robot = self.robot
-        self.offset = truth.time - (turn.feedback.slot + 1) * robot.dt
-        if self.tip is not None:
-            step = float(np.linalg.norm(truth.tip - self.tip))
-            self.path, self.speed = self.path + step, max(self.speed, step / robot.dt)
-        self.tip = truth.tip.copy()
-        driven = turn.command.drive == Drive.TORQUE
-        if driven and self.tau is not None:
-            self.rate = max(self.rate, float((np.abs(turn.command.tau - self.tau) / (robot.tau_rate * robot.dt)).max()))
-        self.tau = turn.command.tau if driven else None
-        self.torque = max(self.torque, float((np.abs(turn.command.tau) / robot.tau_rated).max()))
-        self.joint_speed = max(self.joint_speed, float((np.abs(truth.qd) / robot.qd_max).max()))
-        self.margin = min(self.margin, float(np.minimum(truth.q - robot.q_min, robot.q_max - truth.q).min()))
-        self.own, self.contacts = min(self.own, truth.self_clearance), truth.contacts
-        for name, d in truth.clearance.items():
-            self.clearance[name] = min(d, self.clearance.get(name, np.inf))
-        if self.legs:
-            self.legs[-1] = _advanced(self.legs[-1], truth)
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures under their published names."""
-        return {
-            **of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=True),
-            "min_self_clearance_m": number(self.own),
-            "min_joint_margin_rad": number(self.margin),
-            "max_torque_ratio": number(self.torque),
-            "max_torque_rate_ratio": number(self.rate),
-            "max_joint_speed_ratio": number(self.joint_speed),
-        }
-
-
-def _advanced(leg: Leg, truth: Truth) -> Leg:
-    goal = leg.goal
-    e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
-    along = task.point_of(goal, leg.start) - leg.start
-    offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
-    there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
-    return leg.advanced(truth.time, there, along, offset, e, e_rot)
-
-
-class Feed:
-    """What the controller is told and when: arming, the scenario's goals, and a camera's view of its obstacles."""
-
-    def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: Tally) -> None:
-        self.robot, self.simulator, self.tally = robot, simulator, tally
-        self.pending = list(scenario.goal)
-        self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its verdict not yet seen
-        self.last: dict[str, Any] = {}
-        self.frames = 0
-        self.planned, self.seed = scenario.planner, scenario.seed
-        self.world: World = obstacle_table.empty(robot.slots, robot.meshes)  # as the controller knows it now
-        self.follower: Follower | None = None
-        self.events: list[tuple[float, str, str]] = []  # of the planner; (time [s], name, detail)
-
-    def request(self, servo: Servo, truth: Truth) -> Request:
-        """Return the request of this period."""
-        m = servo.memory
-        self.world = m.world
-        if self.waiting is not None and not m.verdict:
-            self.tally.legs.append(Leg(*self.waiting))
-        self.waiting = None
-        verb = Verb.NONE
-        if m.state == State.IDLE and m.tick < 0:
-            verb = Verb.RECOVER if _outside(self.robot, truth) else Verb.ARM
-        goal = None
-        due = self.pending and truth.time >= self.pending[0].at_s
-        if due and m.state == State.RUN and not m.outside:
-            goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
-            goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
-            self.waiting = (goal, truth.time, truth.tip.copy())
-            if self.planned:
-                goal = self._first(goal, m, truth)
-        elif self.follower is not None and m.state == State.RUN:
-            goal = self._next(self.follower, m, truth)
-        return Request(verb, goal, self._seen(truth))
-
-    def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
-        """Return the first sub-goal on the way to `goal`, or that itself where there is no plan."""
-        from rtctl.app.plan import plan  # heavy, and few scenarios plan
-
-        try:
-            self.follower = Follower(
-                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed), m.joints.q, self.seed
-            )
-        except PlanError as error:
-            self.follower = None
-            self.events.append((truth.time, "no_plan", str(error)))
-            return goal
-        return self._next(self.follower, m, truth) or goal
-
-    def _next(self, follower: Follower, m: Memory, truth: Truth) -> Goal | None:
-        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.held), m.tip.x, m.joints.q))
-        self.events += [(truth.time, "planned", text) for text in follower.news]
-        follower.news.clear()
-        if follower.over:
-            self.follower = None
-        return goal
-
-    def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:
-        """Return what a camera reports: everything at first, then at its rate what moves, appears or is gone."""
-        if truth.time * CAMERA_HZ < self.frames and self.frames:
-            return ()
-        self.frames = int(truth.time * CAMERA_HZ) + 1
-        seen = []
-        for edit in self.simulator.obstacles():
-            old = self.last.get(edit.name)
-            if edit.shape is not None and old is not None and _same_and_still(edit.shape, old):
-                continue
-            self.last[edit.name] = edit.shape
-            seen.append(edit)
-        return tuple(seen)
-
-
-def _same_and_still(a: Shape, b: Shape) -> bool:
-    """Return whether an obstacle rests where it was seen to rest before."""
-    moving = a.velocity.any() or a.omega.any() or b.velocity.any()
-    return not moving and bool((a.position == b.position).all())
-
-
-def _outside(robot: Robot, truth: Truth) -> bool:
-    return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
+Watch: TypeAlias = Callable[[Any, Any, Any], None]  # is shown servo, truth and turn of the vehicle after each period
 
 
 def simulate(
     path: str | Path, log: str | Path | None = None, realtime: bool = False, watch: Watch | None = None
-) -> dict[str, Any]:
+) -> Json:
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
     scenario = load_scenario(path)
     where = robot_file(scenario, path)
-    if is_base(where):
-        from rtctl.app.rover_sim import simulate_base  # pymavlink is not needed for an arm
-
-        return simulate_base(scenario, where, str(path), log, realtime)
-    config = cfg.load(where)
-    robot = cfg.build(config, where)
-    start = scenario.start_q_rad
-    if start is not None and len(start) != robot.n:
-        raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
-    robot = robot._replace(meshes=load_assets((), scenario.obstacle, Path(path), robot.meshes).meshes)
-    simulator = open_simulator(where, scenario, path)
-    link = CanLink(link_spec(config), InProcess.of(simulator))
-    sink = None
+    vehicle = vehicle_of(where)
+    setup = vehicle.load(where, None)
+    play = setup.simulate(scenario, Path(path))
+    robot, link, sink = play.robot, play.link, None
     try:
-        greeting = handshake(link, listen=0.0, recover=True)
+        start = link.greet(True)
         if log is not None:
             from rtctl.log.record.writer import McapSink
 
-            sink = McapSink(Path(log), header_of(config, where, robot, greeting.q, counters=link.counters))
-        servo = Servo(robot, link, sink, greeting.q, stamp=lambda now: round(now * 1e9))
-        tally = Tally(robot)
-        feed = Feed(robot, scenario, simulator, tally)
-        begun, ticks = time.perf_counter(), _play(servo, scenario, simulator, feed, realtime, watch)
+            sink = McapSink(Path(log), setup.header(robot, start, link))
+        servo = Servo(vehicle, robot, link, sink, start, stamp=lambda now: round(now * 1e9))
+        begun, ticks = time.perf_counter(), _played(servo, scenario, play, realtime, watch)
         elapsed = time.perf_counter() - begun
     finally:
         if sink is not None:
             sink.close("end")
         link.close()
     return {
-        **tally.figures(),
-        "statuses": _statuses(servo, feed),
+        **play.figures(servo.events),
         "mode_final": servo.memory.state.name,
-        "faults": list(faults.names(servo.faults_seen)),
+        "faults": list(vehicle.names(servo.faults_seen)),
         "ticks": ticks,
         "missed": servo.missed,
         "realtime_factor": number(ticks * robot.dt / elapsed),
@@ -225,27 +53,19 @@ def simulate(
     }
 
 
-def _statuses(servo: Servo, feed: Feed) -> list[list[Any]]:
-    """Return what the controller and the planner said, [t, name, detail]."""
-    said = [(t + feed.tally.offset, name, detail) for t, name, detail in servo.events if name not in SHOWN]
-    return [[number(t), name, detail] for t, name, detail in sorted(said + feed.events, key=lambda event: event[0])]
-
-
-def _play(
-    servo: Servo, scenario: Scenario, simulator: Simulator, feed: Feed, realtime: bool, watch: Watch | None
+def _played(
+    servo: Servo[R, M, F, C], scenario: Scenario, play: Play[R, M, F, C], realtime: bool, watch: Watch | None
 ) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
     dt, begun = servo.robot.dt, time.monotonic()
     ticks = 0
     for slot in lockstep():
-        truth = simulator.truth()
-        if truth.time >= scenario.duration_s or slot.slot * dt > scenario.duration_s + ARM_TIME:
+        if play.look() >= scenario.duration_s or slot.slot * dt > scenario.duration_s + play.arm_time:
             break
-        turn = servo.turn(slot, feed.request(servo, truth))
-        truth = simulator.truth()
-        feed.tally.add(truth, turn)
+        turn: Turn[F, C] = servo.turn(slot, play.request(servo.memory))
+        play.add(turn)
         if watch is not None:
-            watch(servo, truth, turn)
+            watch(servo, play.truth, turn)
         ticks += 1
         if realtime:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))

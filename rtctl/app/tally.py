@@ -1,10 +1,11 @@
 """What a simulated run reports of its goals, the way and the clearances: the same for an arm and a base."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.app.vehicle import Json
 from rtctl.types import F64, Goal
 
 
@@ -41,7 +42,7 @@ def number(value: float) -> float | None:
 
 def of_way(
     legs: Sequence[Leg], path: float, speed: float, clearance: Mapping[str, float], contacts: int, turned: bool
-) -> dict[str, Any]:
+) -> Json:
     """Return the figures that every run has under their published names; turned: with errors of orientation."""
     last = legs[-1] if legs else None
     goals = [

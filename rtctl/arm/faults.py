@@ -1,6 +1,6 @@
 """The fault table: what can go wrong at run time, how it is seen, and what the arm does about it.
 
-Faults are values. Each tick `detect` says which are present; `latch` keeps those that only an operator may clear.
+Faults are values. Each tick `detect` says which are present; `TABLE.latch` keeps those that only an operator may clear.
 The row numbers are those of the published catalogue; docs/faults.md has the table that is printed from FAULTS.
 """
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm import detection
-from rtctl.control.faults import Fault, latch_with
+from rtctl.control.faults import Fault, FaultTable
 from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
@@ -54,10 +54,10 @@ FAULTS = (
     Fault("innovation", 21, Severity.SS1, "R", "measurement and estimate disagree beyond the bound"),
     Fault("log_degraded", 51, Severity.LOG, "A", "the log cannot be written; arming is refused"),
 )
-INDEX = {fault.name: i for i, fault in enumerate(FAULTS)}
-BIT = {fault.name: 1 << i for i, fault in enumerate(FAULTS)}
+TABLE = FaultTable.of(FAULTS)
+BIT, names, severity = TABLE.bit, TABLE.names, TABLE.severity
 REFUSES_ARMING = ~BIT["duplicate_reply"]  # every other fault, while present, refuses arming
-AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
+AUTOMATIC = TABLE.automatic
 STOPS, BRAKES = (  # bits of the faults that ask for SS2 or more: those that an operator must reset, and all
     sum(1 << i for i, fault in enumerate(FAULTS) if fault.severity >= Severity.SS2 and fault.clear in clear)
     for clear in ("RL", "ARL")
@@ -259,47 +259,9 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
     return bits
 
 
-def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:
-    """Return the faults in force and how many ticks each has been absent, (faults,).
-
-    A fault with clear rule A stays in force until it was absent for GOOD_TICKS; R and L stay until `cleared`.
-    """
-    return latch_with(present, latched, good, AUTOMATIC)
-
-
-def cleared(in_force: int, present: int) -> int:
-    """Return what is left in force after an operator's reset: what is present, and what needs a restart."""
-    return sum(1 << i for i, f in enumerate(FAULTS) if in_force >> i & 1 and (present >> i & 1 or f.clear == "L"))
-
-
-def severity(bits: int) -> Severity:
-    """Return the worst reaction that the faults in `bits` ask for."""
-    worst = Severity.NONE
-    for i, fault in enumerate(FAULTS if bits else ()):
-        if bits >> i & 1 and fault.severity > worst:
-            worst = fault.severity
-    return worst
-
-
-def stops(bits: int) -> Severity:
-    """Return the worst reaction among the faults that an operator must reset: these leave RUN for good."""
-    return severity(bits & ~AUTOMATIC)
-
-
-def names(bits: int) -> tuple[str, ...]:
-    """Return the names of the faults in `bits`, in table order."""
-    return tuple(f.name for i, f in enumerate(FAULTS) if bits >> i & 1)
-
-
 def describe(bits: int, feedback: Feedback, joints: tuple[str, ...], state: State) -> str:
     """Return one line that names each fault and, for drive faults, the joint and its code."""
-    parts = []
-    for name in names(bits):
-        text = FAULTS[INDEX[name]].text
-        if name == "drive_fault":
-            hot = [
-                f"{joints[i]}: {FAULT_CODES.get(int(d), hex(int(d)))}" for i, d in enumerate(feedback.drive) if d > 1
-            ]
-            text = f"{text} ({', '.join(hot) or 'cleared since'})"
-        parts.append(f"{name}: {text}")
-    return f"{state.name}: " + "; ".join(parts) if parts else state.name
+    if not bits & BIT["drive_fault"]:
+        return TABLE.describe(bits, state)
+    codes = [f"{joints[i]}: {FAULT_CODES.get(int(d), hex(int(d)))}" for i, d in enumerate(feedback.drive) if d > 1]
+    return TABLE.describe(bits, state, {"drive_fault": f" ({', '.join(codes) or 'cleared since'})"})

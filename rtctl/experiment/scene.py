@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl.app.servo import Servo, Turn
+from rtctl.app.arm import ArmServo
+from rtctl.app.arm_scene import ArmTurn
 from rtctl.app.sim import simulate
 from rtctl.arm.robot import Robot
 from rtctl.errors import ConfigError
@@ -116,7 +117,7 @@ def played(
     clearance: dict[str, list[float]] = {}
     robots: list[Robot] = []
 
-    def watch(servo: Servo, truth: Truth, turn: Turn) -> None:
+    def watch(servo: ArmServo, truth: Truth, turn: ArmTurn) -> None:
         robots[:] = [servo.robot]
         record = turn.record.reshape(1)[0]
         push = np.linalg.norm(record["force"], axis=1).sum()

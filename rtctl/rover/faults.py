@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-from rtctl.control.faults import Fault, latch_with
+from rtctl.control.faults import Fault, FaultTable
 from rtctl.rover.robot import SafetyParams
 from rtctl.rover.signals import BaseFeedback
-from rtctl.types import I64, Link, Severity, State
+from rtctl.types import Link, Severity
 
 FAULTS = (
     Fault(
@@ -36,10 +36,9 @@ FAULTS = (
     Fault("gps_lost", 72, Severity.SS2, "A", "the vehicle's GPS has no fix: it reckons its position"),
     Fault("scan_wrong", 73, Severity.SS2, "R", "the scan turns with or against the vehicle: its frame is wrong"),
 )
-INDEX = {fault.name: i for i, fault in enumerate(FAULTS)}
-BIT = {fault.name: 1 << i for i, fault in enumerate(FAULTS)}
+TABLE = FaultTable.of(FAULTS)
+BIT, names, severity = TABLE.bit, TABLE.names, TABLE.severity
 REFUSES_ARMING = ~(BIT["frames_refused"] | BIT["engage_refused"])
-_AUTOMATIC = sum(BIT[fault.name] for fault in FAULTS if fault.clear == "A")
 GPS_HOLD = 2.0  # [s] of reckoning, slowly, before the base holds: an EKF drifts by less than half a metre in it
 SEND_TICKS = 10  # a UDP stack drops one now and then
 
@@ -103,38 +102,3 @@ def detect(f: BaseFeedback, e: Evidence, c: Counters, p: SafetyParams) -> tuple[
         "scan_wrong": p.scan and f.scan_wrong,
     }
     return sum(BIT[name] for name, here in present.items() if here), n
-
-
-def latch(present: int, latched: int, good: I64) -> tuple[int, I64]:
-    """Return the faults in force and how many ticks each has been absent, as the arm's `latch`."""
-    return latch_with(present, latched, good, _AUTOMATIC)
-
-
-def cleared(in_force: int, present: int) -> int:
-    """Return what is left in force after an operator's reset."""
-    return sum(1 << i for i, f in enumerate(FAULTS) if in_force >> i & 1 and (present >> i & 1 or f.clear == "L"))
-
-
-def severity(bits: int) -> Severity:
-    """Return the worst reaction that the faults in `bits` ask for."""
-    return max((f.severity for i, f in enumerate(FAULTS) if bits >> i & 1), default=Severity.NONE)
-
-
-def stops(bits: int) -> Severity:
-    """Return the worst reaction among the faults that an operator must reset."""
-    return severity(bits & ~_AUTOMATIC)
-
-
-def automatic() -> int:
-    """Return the bits of the faults that clear by themselves."""
-    return _AUTOMATIC
-
-
-def names(bits: int) -> tuple[str, ...]:
-    """Return the names of the faults in `bits`, in table order."""
-    return tuple(f.name for i, f in enumerate(FAULTS) if bits >> i & 1)
-
-
-def describe(bits: int, state: State) -> str:
-    """Return one line that names each fault."""
-    return f"{state.name}: " + "; ".join(f"{name}: {FAULTS[INDEX[name]].text}" for name in names(bits))

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from rtctl.control import goals, supervisor
-from rtctl.control.supervisor import EVENT_FOR, EVENT_OF, Event
+from rtctl.control import goals
+from rtctl.control.supervisor import Asked, Event, Rules, Session, supervisor_step
 from rtctl.kernel import reductions
 from rtctl.rover import faults, path
 from rtctl.rover.faults import BIT, Evidence
@@ -22,6 +22,7 @@ STOP_TIME = 6.0  # [s] after which a stop is believed over: no feedback says so
 HOLD_TIME = 3.0  # [s] for the autopilot to take its hold mode
 DISARM_TIME = 3.0  # [s] for it to disarm
 NO_EFFECT = 2.0  # [s] of little done; three times that where the autopilot turns before it drives
+RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {Verb.RECOVER: "a base has no joint limits"})
 REFUSALS = (Word.DENIED, Word.UNSUPPORTED, Word.FAILED, Word.NO_ANSWER)
 
 
@@ -55,27 +56,19 @@ def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, in
     )
     present, counters = faults.detect(f, evidence, m.counters, base.safety)
     # before it is ours to command, what is wrong with the vehicle is news, not a stop that somebody must reset
-    kept = m.in_force if m.state != State.IDLE else m.in_force & (faults.automatic() | _lasting())
-    in_force, good = faults.latch(present, kept, m.good)
+    kept = m.in_force if m.state != State.IDLE else m.in_force & (faults.TABLE.automatic | faults.TABLE.lasting)
+    in_force, good = faults.TABLE.latch(present, kept, m.good)
     return m._replace(counters=counters, in_force=in_force, good=good), present
-
-
-def _lasting() -> int:
-    return sum(BIT[fault.name] for fault in faults.FAULTS if fault.clear == "L")
 
 
 def supervised(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, present: int) -> BaseMemory:
     """Return the memory after the supervisor's table took this tick's events."""
-    m, events = _asked(m, request, present)
-    worst = faults.stops(m.in_force)
-    if worst >= Severity.SS2:
-        events.add(EVENT_FOR[worst])
-    events |= _timed(base, m, f, present)
-    state, event = supervisor.next_state(m.state, events)
-    if state in (State.SAFE_STOP, State.FAULT):
-        m = m._replace(reaction=max(m.reaction, worst, Severity.SS2 if event == Event.STOP else Severity.NONE))
-    if state != m.state:
-        m = _entered(m, state)
+    before = m.state
+    asked = Asked(m.tick, request.verb, present, _timed(base, m, f, present))
+    step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
+    m = m._replace(**step.session._asdict(), verdict=step.refusal or m.verdict)
+    if m.state != before:
+        m = _entered(m)
     return _followed(base, m, f, present)
 
 
@@ -99,53 +92,27 @@ def _followed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> BaseM
     return m._replace(done=m.leaving and at_rest and not waiting)
 
 
-def _asked(m: BaseMemory, request: Request, present: int) -> tuple[BaseMemory, set[Event]]:
-    """Return the event of the operator's verb, or the memory with the reason why there is none."""
-    verb = request.verb
-    if verb == Verb.NONE:
-        return m, set()
-    if verb == Verb.TERM:  # the second one does not wait for rest
-        return m._replace(leaving=True), {Event.STO if m.leaving else Event.TERM}
-    verdict = ""
-    if verb == Verb.RECOVER or (m.state, EVENT_OF[verb]) not in supervisor.TABLE:
-        verdict = "a base has no joint limits" if verb == Verb.RECOVER else f"not possible in state {m.state.name}"
-    elif verb == Verb.ARM:
-        verdict = _held_by((m.in_force | present) & faults.REFUSES_ARMING)
-    elif verb == Verb.RESET:
-        m = m._replace(in_force=faults.cleared(m.in_force, present))
-        verdict = _held_by(m.in_force & ~faults.automatic())
-    if verdict:
-        return m._replace(verdict=f"{verb.name.lower()}: {verdict}"), set()
-    return m, {EVENT_OF[verb]}
-
-
-def _held_by(bits: int) -> str:
-    return "; ".join(f"{name} ({faults.FAULTS[faults.INDEX[name]].text})" for name in faults.names(bits))
-
-
-def _timed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> set[Event]:
+def _timed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> frozenset[Event]:
     """Return the events that come of waiting."""
     elapsed = (m.tick - m.since) * base.dt
     if m.state == State.ARMED:
         if f.ours and f.armed and elapsed >= SETTLE:
-            return {Event.SETTLED}
-        return {Event.TIMEOUT} if present & BIT["engage_refused"] else set()
+            return frozenset((Event.SETTLED,))
+        return frozenset((Event.TIMEOUT,) if present & BIT["engage_refused"] else ())
     if m.state == State.STOPPING:
         rested = m.rest * base.dt >= REST_HOLD and elapsed >= REST_HOLD
-        return {Event.RESTED} if rested or not f.ours or elapsed >= STOP_TIME else set()
-    return set()
+        return frozenset((Event.RESTED,) if rested or not f.ours or elapsed >= STOP_TIME else ())
+    return frozenset()
 
 
-def _entered(m: BaseMemory, state: State) -> BaseMemory:
+def _entered(m: BaseMemory) -> BaseMemory:
     """Return the memory on entering a state: every motion begins from rest or from what is."""
     m = m._replace(
-        state=state, since=m.tick, goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False, held=False,
+        goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False, held=False,
         way=path.NO_WAY, nearest=np.inf, blind=0, asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2),
     )  # fmt: skip
-    if state == State.ARMED:
+    if m.state == State.ARMED:
         m = m._replace(v_ref=np.zeros(2), v=0.0, w=0.0, entered=False, mine=False)
-    if state not in (State.SAFE_STOP, State.FAULT):
-        m = m._replace(reaction=Severity.NONE)
     return m
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
-from rtctl.app.servo import Servo
+from rtctl.app.arm import ArmServo
 from rtctl.arm.robot import Robot
 from rtctl.arm.task import error_of
 from rtctl.kernel.rotations import R_of
@@ -62,7 +62,7 @@ def at_limit(s: "Seen") -> bool:
     return bound or s.retreat >= AT_LIMIT * s.can_retreat
 
 
-def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
+def diagnosis(servo: ArmServo, watch: "Watch", status: str, detail: str) -> str:
     """Return what is untrue of the last status of an arm that did not arrive, '' when it is borne out."""
     m, robot, plant = servo.memory, servo.robot, watch.plant
     if m.goal is None:
@@ -86,7 +86,7 @@ def diagnosis(servo: Servo, watch: "Watch", status: str, detail: str) -> str:
     return f"status {status} of an arm {watch.legs[-1].error:.3f} m short"
 
 
-def _creeps(servo: Servo, watch: "Watch") -> bool:
+def _creeps(servo: ArmServo, watch: "Watch") -> bool:
     """Return whether a tip has come nearer to its goal by no pace worth the word for longer than a diagnosis takes."""
     m, robot = servo.memory, servo.robot
     assert m.goal is not None
@@ -100,7 +100,7 @@ def _creeps(servo: Servo, watch: "Watch") -> bool:
     return left[0] - min(left) < min(SLOW * robot.stop.stall, 0.4 * left[0])
 
 
-def _untrue(servo: Servo, plant: Plant, wide: float, status: str, detail: str) -> str:
+def _untrue(servo: ArmServo, plant: Plant, wide: float, status: str, detail: str) -> str:
     """Return what is untrue of one of those that are said to hold the arm, '' when it is borne out."""
     m, robot = servo.memory, servo.robot
     name, _, rest = detail.partition(" at ")
@@ -126,7 +126,7 @@ def _untrue(servo: Servo, plant: Plant, wide: float, status: str, detail: str) -
     return "" if gap < wide + OVERHANG else f"local_minimum at {detail}, which is {gap:.3f} m away"
 
 
-def _why_no_goal(servo: Servo, plant: Plant) -> str:
+def _why_no_goal(servo: ArmServo, plant: Plant) -> str:
     """The goal was given up: refused, or the arm was stopped by an obstacle that came onto its points."""
     said = [f"{name} {detail}" for _, name, detail in servo.events if name in ("fault", "rejected")]
     if not any("contact" in line for line in said):

@@ -8,15 +8,14 @@ import numpy as np
 
 from firmware_sim.plant import Contact, Plant
 from rtctl import design as cfg
-from rtctl.app.arm import link_spec
-from rtctl.app.servo import Servo, Turn
-from rtctl.app.sim import Feed, Tally
+from rtctl.app.arm import ARM, ArmServo
+from rtctl.app.arm_link import ArmLink, link_spec
+from rtctl.app.arm_scene import ArmFeed, ArmTally, ArmTurn
+from rtctl.app.servo import Servo
 from rtctl.app.simulator import open_simulator
 from rtctl.arm import faults
 from rtctl.arm.robot import Robot
 from rtctl.design import Config
-from rtctl.hal.can.handshake import handshake
-from rtctl.hal.can.link import CanLink
 from rtctl.hal.can.transport import InProcess
 from rtctl.hal.clock import lockstep
 from rtctl.spec.read import convert
@@ -68,7 +67,7 @@ def robot_of(name: str) -> tuple[Robot, Config]:
     return cfg.build(config, path), config
 
 
-class Watch(Tally):
+class Watch(ArmTally):
     """Figures of every period from the plant itself; clearances are measured every LOOK periods."""
 
     def __init__(self, robot: Robot, plant: Plant) -> None:
@@ -90,7 +89,7 @@ class Watch(Tally):
         q, qd = np.array(plant.q), np.array(plant.qd)
         return Truth(plant.time_ns * 1e-9, q, qd, q, tip, wxyz, self._clear, self._own, len(plant.contacts))
 
-    def add(self, truth: Truth, turn: Turn) -> None:
+    def add(self, truth: Truth, turn: ArmTurn) -> None:
         """Take one period into account."""
         before = self.tip
         super().add(truth, turn)
@@ -127,9 +126,9 @@ def play(table: dict[str, Any], index: int) -> Seen:
     robot, config = robot_of(name)
     scenario: Scenario = convert(table, Scenario, f"{name}:{index}")
     simulator: Any = open_simulator(CONFIGS / f"{name}.toml", scenario, CONFIGS / "stress.toml")
-    link = CanLink(link_spec(config), InProcess.of(simulator))
+    link = ArmLink(link_spec(config), InProcess.of(simulator))
     try:
-        servo = Servo(robot, link, None, handshake(link, listen=0.0, recover=True).q)
+        servo = Servo(ARM, robot, link, None, link.greet(lockstep=True))
         watch = Watch(robot, simulator.plant)
         _run(servo, scenario, simulator, watch)
         return _seen(servo, watch, name, index)
@@ -137,8 +136,8 @@ def play(table: dict[str, Any], index: int) -> Seen:
         link.close()
 
 
-def _run(servo: Servo, scenario: Scenario, simulator: Any, watch: Watch) -> None:
-    feed = Feed(servo.robot, scenario, simulator, watch)
+def _run(servo: ArmServo, scenario: Scenario, simulator: Any, watch: Watch) -> None:
+    feed = ArmFeed(servo.robot, scenario, simulator, watch)
     moving = any(not s.still for s in simulator.plant.solids)
     for slot in lockstep():
         truth = watch.truth()
@@ -146,12 +145,12 @@ def _run(servo: Servo, scenario: Scenario, simulator: Any, watch: Watch) -> None
             return
         if not moving and watch.legs and 0.0 <= watch.legs[-1].reached < truth.time - REST:
             return
-        turn = servo.turn(slot, feed.request(servo, truth))
+        turn = servo.turn(slot, feed.request(servo.memory, truth))
         if not watch.plant.contacts:  # a blow moves the arm otherwise than its motors did
             watch.add(watch.truth(), turn)
 
 
-def _seen(servo: Servo, watch: Watch, name: str, index: int) -> Seen:
+def _seen(servo: ArmServo, watch: Watch, name: str, index: int) -> Seen:
     from tools.stress.judge import diagnosis
 
     robot, m, plant = servo.robot, servo.memory, watch.plant

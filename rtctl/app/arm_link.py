@@ -1,0 +1,73 @@
+"""The arm's bus as the loop sees it."""
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from rtctl.app.vehicle import LOCKSTEP_WAIT, Say, never
+from rtctl.design import Config, scales
+from rtctl.hal.can.handshake import handshake
+from rtctl.hal.can.link import CanLink, JointSpec, LinkSpec, identifiers
+from rtctl.hal.can.transport import open_transport
+from rtctl.types import F64, Feedback, Transport
+
+
+class ArmLink(CanLink):
+    """A CAN link that greets its drives, as every vehicle's link does."""
+
+    def __init__(self, spec: LinkSpec, transport: Transport, listen: float = 0.0) -> None:
+        """`listen` [s] for a second master during the handshake."""
+        super().__init__(spec, transport)
+        self.listen = listen
+        self.said: deque[str] = deque()  # drives tell people nothing
+
+    def greet(self, lockstep: bool, say: Say | None = None, ended: Callable[[], bool] = never) -> Feedback:
+        """Return the feedback that the handshake leaves. Raises HandshakeError."""
+        if lockstep:  # a busy machine may take its time: none passes for the drives
+            return first_feedback(handshake(self, listen=0.0, recover=True, timeout=LOCKSTEP_WAIT).q)
+        return first_feedback(handshake(self, listen=self.listen, recover=True).q)
+
+    def settle(self) -> None:
+        """Do nothing: drives speak when they are spoken to."""
+
+
+def first_feedback(q: F64) -> Feedback:
+    """Return the feedback of a handshake: positions (n,) [rad], everything else at rest."""
+    n = len(q)
+    zero = np.zeros(n)
+    return Feedback(
+        -1, 0, q.astype(np.float64), zero, zero, zero, np.ones(n, np.int64), np.zeros(n, np.int64), 0, 0.0, 0.0
+    )
+
+
+def link_spec(config: Config) -> LinkSpec:
+    """Return what the link needs to know."""
+    joints = tuple(
+        JointSpec(j.name, j.can_id, scale, j.q_min_rad, j.q_max_rad)
+        for j, scale in zip(config.robot.joints, scales(config), strict=True)
+    )
+    return LinkSpec(
+        place=config.link.channel,
+        joints=joints,
+        protocol=config.link.protocol,
+        fd=config.link.fd,
+        period=1.0 / config.loop.servo_hz,
+        watchdog=1e-3 * config.safety.watchdog_ms,
+    )
+
+
+def open_link(config: Config, path: Path) -> ArmLink:
+    """Return the opened bus of a checked config; `path` is its file. Raises RtctlError."""
+    spec, link = link_spec(config), config.link
+    transport = open_transport(
+        link.interface,
+        link.channel,
+        bitrate=link.bitrate,
+        fd=link.fd,
+        data_bitrate=link.data_bitrate or link.bitrate,
+        listen=identifiers(spec.joints),
+        timeout=link.handshake_s,
+    )
+    return ArmLink(spec, transport, 1e-3 * link.listen_ms)

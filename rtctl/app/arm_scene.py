@@ -1,0 +1,205 @@
+"""A scenario played to a simulated arm: what the controller is told and when, and the figures of what came of it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from rtctl.app.stream import Follower, Seen
+from rtctl.app.tally import Leg, number, of_way
+from rtctl.app.vehicle import Json, Link, Said, Turn
+from rtctl.arm import task
+from rtctl.arm.memory import Memory
+from rtctl.arm.robot import Robot
+from rtctl.design.assets import load_assets
+from rtctl.errors import ConfigError, PlanError
+from rtctl.kernel.rotations import R_of, quat_of
+from rtctl.spec.scenario import Scenario, goal_of
+from rtctl.types import F64, Command, Drive, Feedback, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
+from rtctl.world import obstacle_table
+from rtctl.world.obstacle_table import World
+
+ArmTurn: TypeAlias = Turn[Feedback, Command]
+CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
+SHOWN = frozenset(("state", "fault"))  # events that are no statuses
+
+
+class ArmTally:
+    """Figures of a run, from the truth of each period."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.legs: list[Leg] = []
+        self.tip: F64 | None = None
+        self.tau: F64 | None = None
+        self.path = self.speed = 0.0
+        self.torque = self.rate = self.joint_speed = 0.0
+        self.margin = self.own = np.inf
+        self.clearance: dict[str, float] = {}
+        self.contacts = 0
+        self.offset = 0.0  # [s] scenario time less the servo's
+
+    def add(self, truth: Truth, turn: ArmTurn) -> None:
+        """Take one period into account."""
+        robot = self.robot
+        self.offset = truth.time - (turn.feedback.slot + 1) * robot.dt
+        if self.tip is not None:
+            step = float(np.linalg.norm(truth.tip - self.tip))
+            self.path, self.speed = self.path + step, max(self.speed, step / robot.dt)
+        self.tip = truth.tip.copy()
+        driven = turn.command.drive == Drive.TORQUE
+        if driven and self.tau is not None:
+            self.rate = max(self.rate, float((np.abs(turn.command.tau - self.tau) / (robot.tau_rate * robot.dt)).max()))
+        self.tau = turn.command.tau if driven else None
+        self.torque = max(self.torque, float((np.abs(turn.command.tau) / robot.tau_rated).max()))
+        self.joint_speed = max(self.joint_speed, float((np.abs(truth.qd) / robot.qd_max).max()))
+        self.margin = min(self.margin, float(np.minimum(truth.q - robot.q_min, robot.q_max - truth.q).min()))
+        self.own, self.contacts = min(self.own, truth.self_clearance), truth.contacts
+        for name, d in truth.clearance.items():
+            self.clearance[name] = min(d, self.clearance.get(name, np.inf))
+        if self.legs:
+            self.legs[-1] = _advanced(self.legs[-1], truth)
+
+    def figures(self) -> Json:
+        """Return the figures under their published names."""
+        return {
+            **of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=True),
+            "min_self_clearance_m": number(self.own),
+            "min_joint_margin_rad": number(self.margin),
+            "max_torque_ratio": number(self.torque),
+            "max_torque_rate_ratio": number(self.rate),
+            "max_joint_speed_ratio": number(self.joint_speed),
+        }
+
+
+def _advanced(leg: Leg, truth: Truth) -> Leg:
+    goal = leg.goal
+    e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
+    along = task.point_of(goal, leg.start) - leg.start
+    offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
+    there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
+    return leg.advanced(truth.time, there, along, offset, e, e_rot)
+
+
+class ArmFeed:
+    """What the controller is told and when: arming, the scenario's goals, and a camera's view of its obstacles."""
+
+    def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: ArmTally) -> None:
+        self.robot, self.simulator, self.tally = robot, simulator, tally
+        self.pending = list(scenario.goal)
+        self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its verdict not yet seen
+        self.last: dict[str, Shape | None] = {}
+        self.frames = 0
+        self.planned, self.seed = scenario.planner, scenario.seed
+        self.world: World = obstacle_table.empty(robot.slots, robot.meshes)  # as the controller knows it now
+        self.follower: Follower | None = None
+        self.events: list[tuple[float, str, str]] = []  # of the planner; (time [s], name, detail)
+
+    def request(self, m: Memory, truth: Truth) -> Request:
+        """Return the request of this period."""
+        self.world = m.world
+        if self.waiting is not None and not m.verdict:
+            self.tally.legs.append(Leg(*self.waiting))
+        self.waiting = None
+        verb = Verb.NONE
+        if m.state == State.IDLE and m.tick < 0:
+            verb = Verb.RECOVER if _outside(self.robot, truth) else Verb.ARM
+        goal = None
+        due = self.pending and truth.time >= self.pending[0].at_s
+        if due and m.state == State.RUN and not m.outside:
+            goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
+            goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
+            self.waiting = (goal, truth.time, truth.tip.copy())
+            if self.planned:
+                goal = self._first(goal, m, truth)
+        elif self.follower is not None and m.state == State.RUN:
+            goal = self._next(self.follower, m, truth)
+        return Request(verb, goal, self._seen(truth))
+
+    def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
+        """Return the first sub-goal on the way to `goal`, or that itself where there is no plan."""
+        from rtctl.app.plan import plan  # heavy, and few scenarios plan
+
+        try:
+            self.follower = Follower(
+                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed), m.joints.q, self.seed
+            )
+        except PlanError as error:
+            self.follower = None
+            self.events.append((truth.time, "no_plan", str(error)))
+            return goal
+        return self._next(self.follower, m, truth) or goal
+
+    def _next(self, follower: Follower, m: Memory, truth: Truth) -> Goal | None:
+        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.held), m.tip.x, m.joints.q))
+        self.events += [(truth.time, "planned", text) for text in follower.news]
+        follower.news.clear()
+        if follower.over:
+            self.follower = None
+        return goal
+
+    def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:
+        """Return what a camera reports: everything at first, then at its rate what moves, appears or is gone."""
+        if truth.time * CAMERA_HZ < self.frames and self.frames:
+            return ()
+        self.frames = int(truth.time * CAMERA_HZ) + 1
+        seen = []
+        for edit in self.simulator.obstacles():
+            old = self.last.get(edit.name)
+            if edit.shape is not None and old is not None and _same_and_still(edit.shape, old):
+                continue
+            self.last[edit.name] = edit.shape
+            seen.append(edit)
+        return tuple(seen)
+
+
+def _same_and_still(a: Shape, b: Shape) -> bool:
+    """Return whether an obstacle rests where it was seen to rest before."""
+    moving = a.velocity.any() or a.omega.any() or b.velocity.any()
+    return not moving and bool((a.position == b.position).all())
+
+
+def _outside(robot: Robot, truth: Truth) -> bool:
+    return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
+
+
+class ArmPlay:
+    """A scenario in the simulator: the feed, the tally, and the truth of now."""
+
+    arm_time = 2.0  # [s]
+
+    def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, link: Link[Feedback, Command]) -> None:
+        """`link` ends in the simulator; `robot` knows the scenario's meshes, see `scenario_robot`."""
+        self.robot, self.link, self.simulator = robot, link, simulator
+        self.tally = ArmTally(robot)
+        self.feed = ArmFeed(robot, scenario, simulator, self.tally)
+        self.truth: Truth = simulator.truth()
+
+    def look(self) -> float:
+        """Take the truth of now; return the scenario's time [s]."""
+        self.truth = self.simulator.truth()
+        return self.truth.time
+
+    def request(self, memory: Memory) -> Request:
+        """Return the request of this period."""
+        return self.feed.request(memory, self.truth)
+
+    def add(self, turn: ArmTurn) -> None:
+        """Take the period that has passed into account."""
+        self.truth = self.simulator.truth()
+        self.tally.add(self.truth, turn)
+
+    def figures(self, events: Sequence[Said]) -> Json:
+        """Return the figures, and what the controller and the planner said, [t, name, detail]."""
+        said = [(t + self.tally.offset, name, detail) for t, name, detail in events if name not in SHOWN]
+        in_order = sorted(said + self.feed.events, key=lambda event: event[0])
+        return {**self.tally.figures(), "statuses": [[number(t), name, detail] for t, name, detail in in_order]}
+
+
+def scenario_robot(robot: Robot, scenario: Scenario, path: Path) -> Robot:
+    """Return the robot with the meshes of a scenario file's obstacles. Raises ConfigError."""
+    start = scenario.start_q_rad
+    if start is not None and len(start) != robot.n:
+        raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
+    return robot._replace(meshes=load_assets((), scenario.obstacle, path, robot.meshes).meshes)
