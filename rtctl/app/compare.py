@@ -1,10 +1,11 @@
 """What a replay is compared with: the records and the command frames of the log, bit by bit."""
 
 import json
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple, SupportsInt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rtctl.hal.can.link import CanLink
 from rtctl.log import schema
@@ -13,7 +14,7 @@ from rtctl.log.read.inputs import EVERYTHING
 from rtctl.log.read.run import Run
 from rtctl.log.read.topic import CAN_ROW, Structured, Topic, stacked
 from rtctl.protocol import frame
-from rtctl.types import F64, I64
+from rtctl.types import B1, F64, I64, Record
 
 GIVEN = frozenset(("lateness", "compute"))  # copied through, never computed
 COUNTER_AT = 8  # of the counter in a protected frame's data
@@ -60,7 +61,7 @@ class Check:
             return np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
         return np.concatenate(self.time), np.concatenate(self.tau_logged), np.concatenate(self.tau)
 
-    def compare(self, logged: list[Any], replayed: list[Any]) -> list[int]:
+    def compare(self, logged: Sequence[Record], replayed: Sequence[Record]) -> list[int]:
         """Take a block of ticks into account; return their numbers."""
         ours = np.frombuffer(b"".join(record.tobytes() for record in replayed), replayed[0].dtype)
         theirs = np.frombuffer(b"".join(record.tobytes() for record in logged), logged[0].dtype)
@@ -89,7 +90,7 @@ class Check:
             self.divergence = self._divergence(theirs[first[0]], ours[first[0]], first[1])
         return ticks
 
-    def _note(self, name: str, a: Any, b: Any, rows: Any, ticks: Any) -> None:
+    def _note(self, name: str, a: F64, b: F64, rows: I64, ticks: I64) -> None:
         with np.errstate(invalid="ignore"):
             gap = np.abs(a[rows].astype(np.float64) - b[rows].astype(np.float64)).reshape(len(rows), -1)
         gap[(a[rows] == b[rows]).reshape(gap.shape)] = 0.0  # inf and inf
@@ -102,7 +103,7 @@ class Check:
             here = old._replace(ticks=old.ticks + here.ticks, largest=larger.largest, at=larger.at)
         self._found[name] = here
 
-    def _divergence(self, a: Any, b: Any, name: str) -> Divergence:
+    def _divergence(self, a: Record, b: Record, name: str) -> Divergence:
         one, two = np.atleast_1d(a[name]), np.atleast_1d(b[name])
         index = np.unravel_index(int(np.flatnonzero(_differ(one.reshape(-1, 1), two.reshape(-1, 1)))[0]), one.shape)
         x, y = one[index], two[index]
@@ -116,7 +117,7 @@ class Check:
         return tuple(self._found[name] for name in self.run.header.dtype.names or () if name in self._found)
 
 
-def part_of(name: str, index: tuple[Any, ...], joints: tuple[str, ...]) -> str:
+def part_of(name: str, index: Sequence[SupportsInt], joints: tuple[str, ...]) -> str:
     """Return what an index of a field means: a joint's name, an axis, an obstacle's slot."""
     first = int(index[0])
     if name in ("rho", "force", "point"):
@@ -130,11 +131,12 @@ def part_of(name: str, index: tuple[Any, ...], joints: tuple[str, ...]) -> str:
     return joints[first] if first < len(joints) else str(first)
 
 
-def _differ(a: Any, b: Any) -> Any:
+def _differ(a: F64, b: F64) -> B1:
     """Return the rows that differ in a bit."""
     kind = {8: np.uint64, 4: np.uint32}[a.dtype.itemsize]
     bits = (np.ascontiguousarray(a).view(kind) != np.ascontiguousarray(b).view(kind)).reshape(len(a), -1)
-    return bits.any(axis=1)
+    rows: B1 = bits.any(axis=1)
+    return rows
 
 
 class Wire:
@@ -216,7 +218,7 @@ class Wire:
             at = int(owner[min(row, len(owner) - 1)]) if len(owner) else 0
             self.divergence = self._divergence(ticks[at], period, row, raw, logged)
 
-    def _divergence(self, tick: int, period: float, row: int, raw: Any, logged: Any) -> Divergence:
+    def _divergence(self, tick: int, period: float, row: int, raw: NDArray[np.uint8], logged: Structured) -> Divergence:
         ours = bytes(raw[row, 8 : 8 + int(raw[row, 4])]) if row < len(raw) else b""
         its = bytes(logged["data"][row, : int(logged["dlc"][row])]) if row < len(logged) else b""
         can_id = int(logged["id"][row]) if row < len(logged) else int.from_bytes(raw[row, :4].tobytes(), "little")

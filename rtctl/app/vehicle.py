@@ -151,7 +151,7 @@ class Play(Protocol[R_co, M_contra, F, C]):
     @property
     def arm_time(self) -> float: ...  # [s] beside the scenario's own, within which the vehicle must be running
     @property
-    def truth(self) -> Any: ...  # the simulator's own account of the last period
+    def truth(self) -> object: ...  # the simulator's own account of the last period
 
     def look(self) -> float: ...  # take the truth of now; the scenario's time [s]
     def request(self, memory: M_contra) -> Request: ...

@@ -1,18 +1,21 @@
 """One tick of the base as one struct: everything that came in and went out."""
 
+from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from rtctl.rover.path import CORNERS
 from rtctl.rover.robot import SECTORS
 from rtctl.rover.signals import BaseFeedback
-from rtctl.types import Record
+from rtctl.types import F64, Record
+
+Number: TypeAlias = float | Sequence[float] | F64
 
 
 @cache
-def base_dtype(slots: int) -> "np.dtype[Any]":
+def base_dtype(slots: int) -> "np.dtype[np.void]":
     """Return the dtype of a record; names shared with the arm's record mean the same."""
     f, i, u = "<f8", "<i4", "<u4"
     return np.dtype(
@@ -39,7 +42,7 @@ def base_dtype(slots: int) -> "np.dtype[Any]":
     )  # fmt: skip
 
 
-def make_base_record(slots: int, **values: Any) -> Record:
+def make_base_record(slots: int, **values: Number) -> Record:
     """Return the record of one tick, read-only."""
     record = np.zeros((), base_dtype(slots))
     for name, value in values.items():
@@ -48,7 +51,7 @@ def make_base_record(slots: int, **values: Any) -> Record:
     return record
 
 
-def feedback_from(row: Any) -> BaseFeedback:
+def feedback_from(row: Record) -> BaseFeedback:
     """Return the feedback that a record was made from: with the requests of the log all that a replay needs."""
     kinds = {int: int, bool: bool, float: float}
     values: dict[str, Any] = {}
