@@ -18,7 +18,8 @@ from rtctl.log.mcap.names import Origin, origin_of
 from rtctl.log.record import health, recorder
 from rtctl.log.record.health import DropWatch, Repeats
 from rtctl.log.record.recorder import Recorder
-from rtctl.log.record.writer import Options, Session, old_segments
+from rtctl.log.record.retention import old_segments
+from rtctl.log.record.writer import Options, Session
 from tests.mcap_conformance import CHANNEL, DATA_END, FOOTER, HEADER, MAGIC, MESSAGE, METADATA, _File, mapping, text
 
 ARM = make_header("arm", ("a", "b"), 2, 1e-3, config="x = 1\n", urdf="<robot/>")

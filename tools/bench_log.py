@@ -107,7 +107,7 @@ def stretched(source: Path, target: Path, copies: int) -> float:
     segment = begin(target, header, channels(header), log.span[0], {"segment": "0", "session": target.stem})
     parts = []
     for k in range(len(log._catalog.chunks.body)):
-        raw = np.frombuffer(log._chunk(k) or b"", np.uint8)
+        raw = np.frombuffer(log._chunks.content(k) or b"", np.uint8)
         parts.append((raw, chunk_messages(raw.tobytes())))
     for k in range(copies):
         for raw, rows in parts:

@@ -20,7 +20,7 @@ from rtctl.errors import EXIT_FAILED, EXIT_OK, LogError
 from rtctl.log import Kind, McapSink, make_header, read, read_run
 from rtctl.log.mcap.recovery import recover
 from rtctl.log.read.examine import examine
-from rtctl.log.read.follow import Follower
+from rtctl.log.read.follow import Tail
 from rtctl.log.read.info import info
 from rtctl.log.read.inputs import inputs
 from rtctl.log.read.mend import mend
@@ -84,7 +84,7 @@ def look(path: Path, out: Path) -> None:
         lambda: traffic(read_run(path)),
         lambda: mavlink.listing(read_run(path)),
         lambda: export.to_tlog(read_run(path), out / "t.tlog", quiet),
-        lambda: Follower(path).news(),
+        lambda: Tail(path).news(),
         lambda: mend(path, out / "mended.mcap"),
         lambda: recover(path.rename(path.with_name(path.name + ".open"))),
     ):

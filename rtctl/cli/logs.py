@@ -215,14 +215,14 @@ def _mavlink(arguments: argparse.Namespace) -> int:
 
 
 def _tail(arguments: argparse.Namespace) -> int:
-    from rtctl.log.read.follow import Follower, newest
+    from rtctl.log.read.follow import Tail, newest
 
     path = Path(arguments.path)
-    follower = Follower(newest(path) if path.is_dir() else path)
+    followed = Tail(newest(path) if path.is_dir() else path)
     until = time.monotonic() + arguments.seconds
     shown = -1e9
     while True:
-        news = follower.news()
+        news = followed.news()
         for event in news.events:
             _say(event, arguments.json)
         if len(news.ticks) and float(news.ticks["time"][-1]) - shown >= arguments.every:

@@ -1,23 +1,22 @@
 """Following a log while it is written: what each new chunk of the growing file holds."""
 
-import io
-import struct
+import contextlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from rtctl.errors import LogError
-from rtctl.log import schema
+from rtctl.log import limits, schema
 from rtctl.log.mcap.names import OPEN
 from rtctl.log.mcap.summary import MAGIC
-from rtctl.log.mcap.walk import MESSAGE, RECORD, Damaged, chunk_data, chunk_head, chunk_messages, walk
+from rtctl.log.mcap.walk import MESSAGE, RECORD, Damaged, chunk_data, chunk_head, chunk_messages, parsed, walk
 from rtctl.log.read.reader import read
 from rtctl.log.read.topic import Part, Topic
+
+MOST = 2 * limits.CHUNK  # [bytes] read at a look
 
 
 class News(NamedTuple):
@@ -28,7 +27,7 @@ class News(NamedTuple):
     ended: dict[str, Any]  # the sentinel; {} while it is being written
 
 
-class Follower:
+class Tail:
     """Reads on where it stopped; goes over to the file's final name when its writer has closed it."""
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +48,7 @@ class Follower:
         try:
             with self._file.open("rb") as file:
                 file.seek(self._at)
-                data = file.read()
+                data = file.read(MOST)
         except OSError as error:
             raise LogError(f"{self.path}: {error.strerror}") from None
         found: list[np.ndarray[Any, Any]] = []
@@ -59,11 +58,9 @@ class Follower:
         for opcode, body, end in walk(data, 0, len(data)):
             used = end
             if opcode == Opcode.CHANNEL:
-                try:
-                    channel = records.Channel.read(ReadDataStream(io.BytesIO(data[body:end])))
-                except (McapError, struct.error, ValueError):
-                    continue
-                self._channels[channel.id] = channel
+                with contextlib.suppress(Damaged):
+                    channel = parsed(records.Channel.read, data, body, end)
+                    self._channels[channel.id] = channel
             elif opcode == Opcode.CHUNK:
                 try:
                     content = chunk_data(data, chunk_head(data, body, end))
@@ -77,6 +74,8 @@ class Follower:
                     elif topic.name == schema.SENTINEL:
                         ended = topic.json[-1]
                     del channel_id
+        if not used and len(data) == MOST:
+            raise LogError(f"{self.path}: a record of more than {MOST >> 20} MiB at {self._at}")
         self._at += used
         ticks = np.concatenate(found) if found else np.zeros(0, self.header.dtype)
         return News(ticks, [e for e in events if isinstance(e, dict)], ended)

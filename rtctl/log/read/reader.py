@@ -2,10 +2,7 @@
 
 import contextlib
 import mmap
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,28 +14,16 @@ from rtctl.log import limits, schema
 from rtctl.log.header import Header, header_from_json, of_attachment
 from rtctl.log.mcap.catalog import Catalog, attachment, catalog, describe_chunk
 from rtctl.log.mcap.names import INFO, OPEN, beside
-from rtctl.log.mcap.summary import INDEX_ENTRY
 from rtctl.log.mcap.walk import (
     I64_MAX,
-    MESSAGE,
-    RECORD,
     Damaged,
     Source,
-    chunk_data,
-    chunk_head,
-    chunk_messages,
-    clamped,
-    rows_of,
 )
-from rtctl.log.mcap.walk import message_index as index_entries
+from rtctl.log.read.chunks import ChunkReader
 from rtctl.log.read.topic import Part, Topic
-from rtctl.log.schema import MESSAGE as MESSAGE_HEAD
 from rtctl.types import I64
 
 T = TypeVar("T")
-THREADS = min(4, os.cpu_count() or 1)  # zstd, checksums and numpy's copies let go of the interpreter's lock
-RUN = 16  # chunks that a thread takes at a time: handing over each would cost as much as unpacking it
-PIECE = 64  # chunks at a time of `pieces`
 
 
 class Log:
@@ -53,6 +38,7 @@ class Log:
         except Damaged as error:
             raise LogError(f"{path}: {error}") from None
         self._damaged = set[int]() if damaged is None else damaged  # where their records begin
+        self._chunks = ChunkReader(data, self._catalog, self._damaged)
         self._topics: dict[str, Topic] = {}
         if not self._catalog.channels or not self._catalog.complete:
             self._describe_from_chunks()
@@ -63,7 +49,7 @@ class Log:
         for k, channels in enumerate(self._catalog.chunks.channels()):
             if not known.issuperset(channels.tolist()) or not known or not len(channels):
                 with contextlib.suppress(Damaged):  # what stands before it in the chunk is known
-                    describe_chunk(self._catalog, self._chunk(k) or b"")
+                    describe_chunk(self._catalog, self._chunks.content(k) or b"")
                 known = set(self._catalog.channels)
 
     @property
@@ -111,14 +97,14 @@ class Log:
         """Return by topic: messages, first and last sequence number. From the file's end, else by reading it all."""
         if self._catalog.counts:
             return dict(self._catalog.counts)
-        return dict(self._walked[0])
+        return dict(self._chunks.walked[0])
 
     @property
     def span(self) -> tuple[int, int]:
         """Return log_time [ns] of the first and of the last message; (0, 0) when there is none."""
         if self._catalog.span != (0, 0):
             return self._catalog.span
-        return self._walked[1]
+        return self._chunks.walked[1]
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -230,7 +216,7 @@ class Log:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == topic]
         none = [np.zeros(0, np.int64)]
         return [
-            np.concatenate(list(self._map(lambda part: part.sequence, i, slice(None), True, 0, I64_MAX)) or none)
+            np.concatenate(list(self._chunks.map(lambda part: part.sequence, i, slice(None), True, 0, I64_MAX)) or none)
             for i in ids
         ]
 
@@ -243,26 +229,10 @@ class Log:
 
     def pieces(self, topic: str) -> Iterator[Topic]:
         """Yield a topic some chunks at a time, so that any length fits into memory. Raises LogError without it."""
-        for part in self._runs_of_chunks():
+        for part in self._chunks.runs():
             yield self._topic(topic, part, False)
         if self._catalog.loose:
             yield self._topic(topic, slice(0), True)
-
-    def _runs_of_chunks(self) -> Iterator[slice]:
-        """Yield the chunks in runs of at most PIECE, and of at most limits.UNPACKED bytes if of more than one."""
-        first = size = 0
-        count = len(self._catalog.chunks.body)
-        for k in range(count):
-            try:
-                more = chunk_head(self._data, int(self._catalog.chunks.body[k]), int(self._catalog.chunks.end[k])).size
-            except Damaged:
-                more = 0
-            if k > first and (k - first >= PIECE or size + more > limits.UNPACKED):
-                yield slice(first, k)
-                first, size = k, 0
-            size += more
-        if count:
-            yield slice(first, count)
 
     def _topic(self, name: str, among: slice, loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
@@ -277,108 +247,9 @@ class Log:
                 dtype = self.header.dtype
 
         def source(work: Callable[[Part], T]) -> list[T]:
-            return [done for i in ids for done in self._map(work, i, among, loose, start, stop)]
+            return [done for i in ids for done in self._chunks.map(work, i, among, loose, start, stop)]
 
         return Topic(name, channel, schema_name, dtype, source, limits.held(len(self._data)))
-
-    def _map(
-        self, work: Callable[[Part], T], channel: int, among: slice, loose: bool, start: int, stop: int
-    ) -> Iterator[T]:
-        """Yield what `work` makes of a channel's messages, chunk by chunk; chunks are unpacked by several threads."""
-        chunks = self._catalog.chunks
-        indices = chunks.indices(channel)
-        chosen = (chunks.end_time >= start) & (chunks.start_time < stop) & (indices >= 0)
-        numbers = np.arange(len(chosen))[among]
-        wanted = numbers[chosen[among]].tolist()
-
-        def some(run: list[int]) -> list[T]:
-            contents = ((self._chunk(k), int(indices[k])) for k in run)
-            parts = (
-                _part(content, self._offsets(at, channel, content), channel, start, stop)
-                for content, at in contents
-                if content is not None
-            )
-            return [work(part) for part in parts]
-
-        runs = [wanted[at : at + RUN] for at in range(0, len(wanted), RUN)]
-        if len(runs) > 1:
-            with ThreadPoolExecutor(THREADS) as pool:
-                found = list(pool.map(some, runs))
-        else:
-            found = [some(run) for run in runs]
-        for results in found:
-            yield from results
-        if loose and self._catalog.loose:
-            rows = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
-            yield work(_part(self._data, rows, channel, start, stop))
-
-    def _chunk(self, number: int) -> bytes | None:
-        body, end = int(self._catalog.chunks.body[number]), int(self._catalog.chunks.end[number])
-        try:
-            return chunk_data(self._data, chunk_head(self._data, body, end))
-        except Damaged:
-            self._damaged.add(body)
-            return None
-
-    def _offsets(self, at: int, channel: int, records_of_chunk: bytes) -> I64:
-        """Return where the channel's messages are in a chunk, ascending: by its index at `at`, else by walking."""
-        if at and at + RECORD.size <= len(self._data):
-            try:
-                _, length = RECORD.unpack_from(self._data, at)
-                body = at + RECORD.size
-                found, entries = index_entries(self._data, body, min(body + length, len(self._data)))
-            except Damaged:
-                found, entries = -1, np.zeros(0, INDEX_ENTRY)
-            if found == channel:
-                offsets: I64 = np.array(entries["offset"], dtype=np.int64)
-                offsets.sort()
-                return offsets
-        messages = chunk_messages(records_of_chunk)
-        walked: I64 = messages.offset[messages.channel == channel]
-        return walked
-
-    @cached_property
-    def _walked(self) -> tuple[dict[str, tuple[int, int, int]], tuple[int, int]]:
-        """Return `counts` and `span` from the messages themselves, unpacking each chunk once."""
-        counts: dict[str, tuple[int, int, int]] = {}
-        low, high = I64_MAX, 0
-
-        def add(part: Part, topic: str) -> None:
-            nonlocal low, high
-            if len(part.time):
-                n, first, _ = counts.get(topic, (0, int(part.sequence[0]), 0))
-                counts[topic] = (n + len(part.time), first, int(part.sequence[-1]))
-                low, high = min(low, int(part.time.min())), max(high, int(part.time.max()))
-
-        loose = np.array([body - RECORD.size for body, _ in self._catalog.loose], dtype=np.int64)
-        indices = {i: self._catalog.chunks.indices(i).tolist() for i in self._catalog.channels}
-        for k in range(len(self._catalog.chunks.body)):
-            content = self._chunk(k)
-            for i, channel in self._catalog.channels.items() if content is not None else ():
-                if indices[i][k] >= 0:
-                    at = self._offsets(indices[i][k], i, content or b"")
-                    add(_part(content or b"", at, i, 0, I64_MAX), channel.topic)
-        for i, channel in self._catalog.channels.items() if len(loose) else ():
-            add(_part(self._data, loose, i, 0, I64_MAX), channel.topic)
-        return dict(sorted(counts.items())), (low, high) if counts else (0, 0)
-
-
-def _part(data: Source, offsets: I64, channel: int, start: int, stop: int) -> Part:
-    """Return the messages at `offsets`, which ascend, that are what is wanted."""
-    raw = np.frombuffer(data, np.uint8)
-    size = len(raw)
-    if len(offsets) and (offsets[0] < 0 or offsets[-1] > size - MESSAGE_HEAD.itemsize):
-        offsets = offsets[(offsets >= 0) & (offsets <= size - MESSAGE_HEAD.itemsize)]
-    head = rows_of(raw, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD).reshape(-1)
-    time, at = head["log"], offsets + MESSAGE_HEAD.itemsize
-    good = (head["op"] == 5) & (head["channel"] == channel) & (time >= start)
-    if stop < I64_MAX:
-        good &= time < stop
-    body = head["length"] - np.uint64(MESSAGE.size)  # wraps for a length that is too small: then it is too large
-    good &= body <= (size - at).view(np.uint64)
-    if not good.all():
-        head, at, body = head[good], at[good], body[good]
-    return Part(data, at, body.view(np.int64), clamped(head["log"]), head["sequence"].astype(np.int64))
 
 
 def read(path: Path | str, damaged: set[int] | None = None) -> Log:

@@ -13,7 +13,7 @@ from rtctl.log.header import Header
 from rtctl.log.mcap.rows import Encoded, Rows, assembled, copies, message, rows_for, stamped
 from rtctl.log.record.rover_scene import BaseScene
 from rtctl.log.record.scene import Scene
-from rtctl.log.record.surroundings import HZ, View
+from rtctl.log.record.surroundings import HZ, Drawing
 from rtctl.log.schema import MESSAGE
 from rtctl.types import I64, U8
 
@@ -59,7 +59,7 @@ class Encoder:
         )
         self._has_state = {"q", "qd", "tau_measured"} <= set(header.dtype.names or ())
         self._can: dict[tuple[int, int], Rows] = {}
-        self._scene: View = Scene(header) if self._has_state else BaseScene(header)
+        self._scene: Drawing = Scene(header) if self._has_state else BaseScene(header)
         self._due = 0  # [ns] monotonic, of the next scene
         self._recent: deque[bytes] = deque(maxlen=EVIDENCE)  # the last ticks
         self._evidence: dict[int, list[bytes]] = {}  # by the index of a fault's entry in the batch

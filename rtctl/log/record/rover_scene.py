@@ -9,7 +9,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from rtctl.log.header import Header
 from rtctl.log.record import draw
 from rtctl.log.record.scene import BODY
-from rtctl.log.record.surroundings import View
+from rtctl.log.record.surroundings import Drawing
 
 BASE_LINK = "base_link"
 TALL = 0.2  # [m] of what is flat: footprint and goal
@@ -17,7 +17,7 @@ SPEED = 1.0  # [s] length of the arrow for 1 m/s
 SLOWEST = 0.02  # [m/s] that gets an arrow
 
 
-class BaseScene(View):
+class BaseScene(Drawing):
     """A base among its obstacles; gives the two messages of a moment."""
 
     drawn = ("time", "x", "heading", "goal", "v_world", "way", "scan_start", "scan_step")

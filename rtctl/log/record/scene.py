@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 
 from rtctl.log.header import Header
 from rtctl.log.record import draw
-from rtctl.log.record.surroundings import View
+from rtctl.log.record.surroundings import Drawing
 from rtctl.types import F64
 
 NEWTON = 0.004  # [m] length of an arrow for 1 N
@@ -32,7 +32,7 @@ class Link(NamedTuple):
     joint: int  # of q, -1 for one that is not configured: it stays at zero
 
 
-class Scene(View):
+class Scene(Drawing):
     """An arm among its obstacles; gives the two messages of a moment."""
 
     drawn = ("time", "q", "x", "wxyz", "goal", "force", "point")

@@ -100,7 +100,7 @@ class Surroundings:
         return [thing.shape for thing in self._things.values()]
 
 
-class View(Surroundings, ABC):
+class Drawing(Surroundings, ABC):
     """What moves among the obstacles, and how all of it is drawn."""
 
     drawn: ClassVar[tuple[str, ...]]  # fields of a record without which nothing can be shown

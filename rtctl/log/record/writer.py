@@ -4,7 +4,6 @@ import contextlib
 import os
 import shutil
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,10 +12,11 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.entry import Batch, Payload, empty, stream
 from rtctl.log.header import Header
-from rtctl.log.mcap.names import OPEN, PIN, Origin, logs_in, metadata, origin_of, plain, segment_name
+from rtctl.log.mcap.names import Origin, metadata, segment_name
 from rtctl.log.mcap.recovery import drop_last_chunk, recover
 from rtctl.log.mcap.segment import CHUNK_BYTES, MODE, Segment, begin, open_name
 from rtctl.log.record.encoding import Encoder
+from rtctl.log.record.retention import Retention, session_order
 
 CHUNK_TIME = 0.25  # [s] after which a chunk is written however small
 SYNC_TIME = 1.0  # [s]
@@ -60,27 +60,6 @@ def free_bytes(folder: Path) -> int:
         return 0
 
 
-def old_segments(folder: Path) -> list[Path]:
-    """Return the closed segments of a folder that recorders wrote, the oldest session's first, each by its numbers.
-
-    Another program's files, and those that bear another name than their segment's, are nobody's to delete.
-    """
-    found = []
-    for path in logs_in(folder):
-        origin = origin_of(path) if path.suffix != OPEN else None
-        if origin is not None and path.name == segment_name(origin.session, origin.segment):
-            found.append((origin, path))
-    return [path for _, path in sorted(found)]
-
-
-def session_order(folder: Path, session: str) -> int:
-    """Return a session's place among those of a folder: its own where it has segments there, else behind all others."""
-    firsts = {plain(path).rpartition(".")[0]: path for path in logs_in(folder)}  # one file of each is enough
-    origins = [origin for origin in map(origin_of, firsts.values()) if origin is not None]
-    own = [origin.order for origin in origins if origin.session == session and origin.order]
-    return own[0] if own else max((origin.order for origin in origins), default=0) + 1
-
-
 class Session:
     """Segments one after the other. Never raises for the disk's sake: it becomes `degraded`, and comes back.
 
@@ -109,7 +88,7 @@ class Session:
         self._reserve = options.directory / f".{options.stem}.reserve"
         self._next = first
         self._order = session_order(options.directory, options.stem)
-        self._oldest: deque[Path] = deque()  # logs of the folder that may be deleted, as last looked
+        self._retention = Retention(options.directory)
         self.open()
 
     @property
@@ -185,13 +164,16 @@ class Session:
         except OSError:
             self._fail("disk error")
             return
-        if self._free(self.options.directory) < self.options.floor_bytes and not self._make_room():
+        if not self._has_room() and not self._retention.make_room(self._has_room):
             self.flush()
             if self._segment is not None:
                 self._fail("disk floor")
         elif now - self._opened >= self.options.segment_s or self._segment.size >= self.options.segment_bytes:
             self.finish({"reason": "segment full", "next": segment_path(self.options, self._next).name})
             self.open()
+
+    def _has_room(self) -> bool:
+        return self._free(self.options.directory) >= self.options.floor_bytes
 
     def flush(self) -> None:
         """Write the chunk that is being filled."""
@@ -247,25 +229,6 @@ class Session:
         self._give_up_reserve()
         self.finish({"reason": reason})
         self.degraded = True
-
-    def _make_room(self) -> bool:
-        """Delete the oldest segments of the folder until the floor is met; those with a `.pin` beside them stay.
-
-        Which is older, sessions and their numbers tell, never a clock: after a start at 1970 yesterday's are older yet.
-        """
-        folder = self.options.directory
-        for looked in (False, True):
-            if looked:
-                self._oldest = deque(old_segments(folder))
-            while self._oldest:
-                path = self._oldest.popleft()
-                if path.with_name(path.name + PIN).exists():
-                    continue
-                with contextlib.suppress(OSError):
-                    path.unlink()
-                if self._free(folder) >= self.options.floor_bytes:
-                    return True
-        return False
 
     def close(self, content: Mapping[str, Any], number: int = 0) -> None:
         """Close the log. number: of the last entry that the producer offered, dropped or not."""

@@ -8,7 +8,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 
 from rtctl.kernel.rotations import R_of
-from rtctl.log.view.report.gather import XYZ, Gathered, Way
+from rtctl.log.view.report.gather import XYZ, Gathered
+from rtctl.log.view.report.slots import Way
 from rtctl.log.view.style import FAINT, INK, PAPER, RED, Goal, frame
 from rtctl.types import F64, Shape
 from rtctl.world.outline import axis_view, outline

@@ -10,7 +10,7 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.read.fields import FIELDS, unit_of
 from rtctl.log.read.run import Run
-from rtctl.log.view.report.gather import Slots
+from rtctl.log.view.report.slots import slot_names
 from rtctl.types import F64
 
 BINS = 1500  # across a picture; more samples are drawn as the band between their smallest and largest
@@ -110,16 +110,6 @@ def parts_of(run: Run, name: str, count: int) -> tuple[str, ...]:
         each = count // header.slots
         return tuple(text if each == 1 else f"{text} {'xyz'[k]}" for text in names for k in range(each))
     return header.joints if count == len(header.joints) else tuple(f"{name} {i}" for i in range(count))
-
-
-def slot_names(run: Run) -> list[str]:
-    """Return by slot the names of the obstacles that had it, one after another."""
-    owners = Slots(run, run.header).owner
-    found = []
-    for slot in range(run.header.slots):
-        names = dict.fromkeys(name for _, name in owners.get(slot, ()) if name)
-        found.append(", then ".join(names) or f"slot {slot}")
-    return found
 
 
 def plot_pair(

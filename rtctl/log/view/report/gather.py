@@ -1,6 +1,5 @@
 """Everything a report shows, gathered in one pass over the log, a piece at a time: any length fits into memory."""
 
-import math
 import tomllib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,15 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.errors import LogError
-from rtctl.log import schema
+from rtctl.log import limits, schema
 from rtctl.log.header import Header
 from rtctl.log.read.faults import fault_table
 from rtctl.log.read.fields import called
 from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Part, Structured
-from rtctl.log.record.encoding import event_of
-from rtctl.log.record.surroundings import Surroundings
 from rtctl.log.view.report.bins import Bins, Histogram, Spectrum
+from rtctl.log.view.report.slots import Slots, Way
 from rtctl.spec.bus import frame_time
 from rtctl.types import F64, Cut, State, Status
 
@@ -30,17 +28,6 @@ class Span(NamedTuple):
     start: float  # [s]
     stop: float
     name: str
-
-
-class Way(NamedTuple):
-    """Where an obstacle was seen: for drawing."""
-
-    name: str
-    type: str
-    dims: list[float]
-    path: list[list[float]]  # [m] positions
-    wxyz: list[float]
-    ticks: list[int]  # of each position: since when it was there
 
 
 class Gathered(NamedTuple):
@@ -104,72 +91,6 @@ class _Bits:
 
     def done(self, period: float) -> list[Span]:
         return sorted(span for turns in self._turns.values() for span in turns.done(period))
-
-
-class Slots:
-    """Which obstacle was in which slot, and where: from the requests."""
-
-    def __init__(self, run: Run, header: Header) -> None:
-        scene = Surroundings(header)
-        self.owner: dict[int, list[tuple[int, str]]] = {}  # slot -> (from tick, name)
-        self.ways: dict[str, Way] = {}
-        self.goals: list[list[float]] = []
-        self.asked: list[int] = []  # ticks
-        for slot in range(header.slots):
-            if name := scene.name_of(slot):
-                self.owner[slot] = [(-1, name)]
-        for shape in scene.shapes():
-            self._seen(shape, 0)
-        previous = {slot: rows[-1][1] for slot, rows in self.owner.items()}
-        for payload in run[schema.REQUEST].payloads if schema.REQUEST in run else ():
-            body = event_of(payload)
-            tick = body["tick"] if isinstance(body.get("tick"), int) else 0
-            if isinstance(body.get("goal"), dict):
-                self._aimed(body["goal"], tick)
-            if not body.get("obstacles"):
-                continue
-            scene.request(payload, 0.0)
-            for edit in body["obstacles"] if isinstance(body["obstacles"], list) else ():
-                if isinstance(edit, dict) and isinstance(edit.get("shape"), dict):
-                    self._seen({**edit["shape"], "name": edit.get("name", "")}, tick)
-            for slot in range(header.slots):
-                name = scene.name_of(slot)
-                if name != previous.get(slot, ""):
-                    self.owner.setdefault(slot, []).append((tick, name))
-                    previous[slot] = name
-
-    def _aimed(self, goal: dict[str, Any], tick: int) -> None:
-        try:
-            x, y, z = (round(float(v), 4) for v in goal["position"])
-        except (KeyError, TypeError, ValueError):
-            return
-        if all(map(math.isfinite, (x, y, z))) and (not self.goals or self.goals[-1] != [x, y, z]):
-            self.goals.append([x, y, z])
-            self.asked.append(tick)
-
-    def _seen(self, shape: dict[str, Any], tick: int) -> None:
-        try:
-            name, p = str(shape["name"]), [round(float(v), 4) for v in shape["position"]]
-            dims, wxyz = [float(v) for v in shape["dims"]], [float(v) for v in shape["wxyz"]]
-        except (KeyError, TypeError, ValueError):
-            return
-        old = self.ways.get(name)
-        path, ticks = (old.path, old.ticks) if old is not None else ([], [])
-        if not path or path[-1] != p:
-            path.append(p)
-            ticks.append(tick)
-        self.ways[name] = Way(name, str(shape.get("type", "")), dims, path, wxyz, ticks)
-
-    def mine(self, slot: int, tick: np.ndarray[Any, Any]) -> "list[tuple[str, np.ndarray[Any, Any]]]":
-        """Return by name the rows in which that obstacle had the slot."""
-        rows = self.owner.get(slot, [(-1, f"slot {slot}")])
-        found = []
-        for k, (start, name) in enumerate(rows):
-            stop = rows[k + 1][0] if k + 1 < len(rows) else 1 << 62
-            inside = (tick >= start) & (tick < stop)
-            if name and inside.any():
-                found.append((name, inside))
-        return found
 
 
 def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gathered:
@@ -312,7 +233,7 @@ def _bus_load(run: Run, topic: str, header: Header, width: float = 0.1) -> tuple
     except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
         return np.zeros(0), np.zeros(0)
     start, stop = run.span
-    count = max(1, int((stop - start) / 1e9 / width) + 1)
+    count = min(max(1, int((stop - start) / 1e9 / width) + 1), limits.SPAN_BINS)
 
     def work(part: Part) -> F64:
         size = np.clip(part.size - schema.CAN_DATA_AT, 0, len(cost) - 1)
