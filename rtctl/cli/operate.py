@@ -35,6 +35,7 @@ KEYS_OF = {
 WATCH_PERIOD = 0.1  # [s]
 ARM_TIME = 60.0  # [s] after which `arm` is waited for no more
 EVERYTHING = "*"
+MISSION_MAX = 4_000_000  # characters of a mission's file at most
 
 
 def add(commands: Commands) -> None:
@@ -64,8 +65,9 @@ def add(commands: Commands) -> None:
     goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
-        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, tool_axis, axes, tolerance_m); or JSON:\n"
-        '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.'
+        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, lat,lon, tool_axis, axes, tolerance_m); or JSON:\n"
+        '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.\n'
+        "Of a base also a mission of QGroundControl, .plan or .waypoints, of way-points alone."
     )
     goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
     _add_waiting(goals)
@@ -236,6 +238,7 @@ def _place(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _goals(arguments: argparse.Namespace) -> int:
+    from rtctl.cli import missions
     from rtctl.cli.goals import run_stream
     from rtctl.hal.client import Session
 
@@ -243,6 +246,10 @@ def _goals(arguments: argparse.Namespace) -> int:
         if arguments.file == "-":
             return run_stream(session, sys.stdin, "stdin", arguments)
         with open(arguments.file, encoding="utf-8", errors="replace") as lines:
+            text = lines.read(MISSION_MAX)
+            if missions.is_mission(text):
+                return run_stream(session, missions.goals_of(text, arguments.file), arguments.file, arguments)
+            lines.seek(0)
             return run_stream(session, lines, arguments.file, arguments)
 
 

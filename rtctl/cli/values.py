@@ -14,12 +14,13 @@ GROUPS = {
     "rpy_rad": ("roll", "pitch", "yaw"),
     "wxyz": ("qw", "qx", "qy", "qz"),
     "direction": ("dx", "dy", "dz"),
+    "latlon_deg": ("lat", "lon"),
 }
 SINGLE = ("tolerance_m", "tolerance_rad")
 WORDS = ("axes", "tool_axis")
 KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE + WORDS
 NEEDED = (*GROUPS, "hold")  # one of them: where to go
-WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz or dx,dy,dz; or a JSON object"
+WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz or dx,dy,dz; lat,lon; or a JSON object"
 
 
 def assignments(words: Iterable[str]) -> dict[str, Any]:
