@@ -20,13 +20,14 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from rtctl.app.rover_sim import simulate_base
 
+from rtctl.app.sim import simulate_scenario
 from rtctl.errors import RtctlError
 from rtctl.spec.scenario import FaultTable, Scenario, TimedGoal, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 ROVER = ROOT / "configs" / "rover.toml"
+WORLD_FOLDER = ROOT / "configs" / "worlds"
 WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}  # [s] that an autopilot's own avoidance needed
 CLEARANCE = 0.6  # [m] clearance_m of the config
 NEAR = 2.0  # [m] of the goal, where the clock stops
@@ -63,7 +64,7 @@ class Run(NamedTuple):
 
 def of_world(name: str) -> Scenario:
     """Return a shipped world."""
-    return load_scenario(ROOT / "configs" / "worlds" / f"{name}.toml")
+    return load_scenario(WORLD_FOLDER / f"{name}.toml")
 
 
 def worlds(seeds: int) -> Iterator[Case]:
@@ -120,11 +121,15 @@ def replaced(scenario: Scenario, **changes: Any) -> Scenario:
 def played(case: Case) -> Run:
     """Return what came of a run, judged by the truth."""
     scenario = case.scenario
+    went: list[tuple[float, float, float, float, float]] = []  # time, x, y, yaw, speed: the truth
     try:
-        found = simulate_base(scenario, ROVER, case.world, None, False, track=True)
+        found = simulate_scenario(
+            scenario, ROVER, WORLD_FOLDER / f"{case.world}.toml",
+            watch=lambda servo, truth, turn: went.append((truth.time, truth.x, truth.y, truth.yaw, truth.v)),
+        )  # fmt: skip
     except RtctlError as error:  # it did not even start
         return Run(case.kind, case.world, scenario.seed, False, False, None, None, 0.0, 0, math.inf, str(error))
-    track, goal = np.array(found["track"]), np.array((scenario.goal[-1].position_m or (0.0, 0.0, 0.0))[:2])
+    track, goal = np.array(went), np.array((scenario.goal[-1].position_m or (0.0, 0.0, 0.0))[:2])
     away = np.hypot(*(track[:, 1:3] - goal).T)
     given = float(found["goals"][-1]["at_s"]) if found["goals"] else math.inf
     said = [(name, detail) for _, name, detail in found["statuses"] if name in EXPLAINED]

@@ -24,10 +24,21 @@ def simulate(
 ) -> Json:
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
     scenario = load_scenario(path)
-    where = robot_file(scenario, path)
+    return simulate_scenario(scenario, robot_file(scenario, path), Path(path), log, realtime, watch)
+
+
+def simulate_scenario(
+    scenario: Scenario,
+    where: Path,
+    source: Path,
+    log: str | Path | None = None,
+    realtime: bool = False,
+    watch: Watch | None = None,
+) -> Json:
+    """Return the figures of a scenario for the robot file `where`; paths in it are relative to the file `source`."""
     vehicle = vehicle_of(where)
     setup = vehicle.load(where, None)
-    play = setup.simulate(scenario, Path(path))
+    play = setup.simulate(scenario, source)
     robot, link, sink = play.robot, play.link, None
     try:
         start = link.greet(True)

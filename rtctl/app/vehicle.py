@@ -29,7 +29,7 @@ Event: TypeAlias = tuple[str, str]  # name and detail, for people
 
 
 LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
-LOCKSTEP_SILENT = 0.05  # [s] for replies where a slot went without: a drive that fell silent need not be waited for
+LOCKSTEP_SILENT = 0.05  # [s] the same once a slot went without: a drive that fell silent need not be waited for
 
 
 def never() -> bool:

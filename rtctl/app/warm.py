@@ -86,17 +86,10 @@ def _made(since: float) -> int:
 
 def _robot(config: Path) -> None:
     """Build the robot and let its tick do every kind of work."""
-    from rtctl import design
+    from rtctl.app.choose import vehicle_of
 
-    if is_base(config):
-        from rtctl.design.rover import build as base_of
-        from rtctl.rover.pipe import warm as warm_base
-
-        warm_base(base_of(design.load_base(config), config))
-    else:
-        from rtctl.arm.pipe import warm as warm_arm
-
-        warm_arm(design.build(design.load(config), config))
+    vehicle = vehicle_of(config)
+    vehicle.warm(vehicle.load(config, None).build())
 
 
 def _world() -> None:

@@ -95,15 +95,12 @@ def _sim(arguments: argparse.Namespace) -> int:
 
 
 def _warm(arguments: argparse.Namespace) -> int:
-    from rtctl import design
+    from rtctl.app.choose import vehicle_of
 
     config = arguments.config or str(Path(__file__).parents[2] / "configs" / "panda.toml")
     if not Path(config).is_file():
         raise UsageError(f"warm: {config}: no such file, wanted a config")
-    if design.is_base(config):
-        design.load_base(config)
-    else:
-        design.load(config)
+    vehicle_of(Path(config)).load(Path(config), None)
     _prepare(config, strict=True)
     return EXIT_OK
 
