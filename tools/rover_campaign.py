@@ -27,7 +27,6 @@ from rtctl.spec.scenario import FaultTable, Scenario, TimedGoal, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 ROVER = ROOT / "configs" / "rover.toml"
-WORLD_FOLDER = ROOT / "configs" / "worlds"
 WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}  # [s] that an autopilot's own avoidance needed
 CLEARANCE = 0.6  # [m] clearance_m of the config
 NEAR = 2.0  # [m] of the goal, where the clock stops
@@ -64,7 +63,12 @@ class Run(NamedTuple):
 
 def of_world(name: str) -> Scenario:
     """Return a shipped world."""
-    return load_scenario(WORLD_FOLDER / f"{name}.toml")
+    return load_scenario(file_of(name))
+
+
+def file_of(name: str) -> Path:
+    """Return a shipped world's file."""
+    return ROOT / "configs" / "worlds" / f"{name}.toml"
 
 
 def worlds(seeds: int) -> Iterator[Case]:
@@ -120,16 +124,17 @@ def replaced(scenario: Scenario, **changes: Any) -> Scenario:
 
 def played(case: Case) -> Run:
     """Return what came of a run, judged by the truth."""
-    scenario = case.scenario
-    went: list[tuple[float, float, float, float, float]] = []  # time, x, y, yaw, speed: the truth
+    scenario, places = case.scenario, list[tuple[float, float, float, float]]()  # t, x, y, v
+
+    def watch(servo: Any, truth: Any, turn: Any) -> None:
+        places.append((truth.time, truth.x, truth.y, truth.v))
+
     try:
-        found = simulate_scenario(
-            scenario, ROVER, WORLD_FOLDER / f"{case.world}.toml",
-            watch=lambda servo, truth, turn: went.append((truth.time, truth.x, truth.y, truth.yaw, truth.v)),
-        )  # fmt: skip
+        found = simulate_scenario(scenario, ROVER, file_of(case.world), watch=watch)
     except RtctlError as error:  # it did not even start
-        return Run(case.kind, case.world, scenario.seed, False, False, None, None, 0.0, 0, math.inf, str(error))
-    track, goal = np.array(went), np.array((scenario.goal[-1].position_m or (0.0, 0.0, 0.0))[:2])
+        refuses = case.kind != "worlds" and not case.kind.startswith("bias")  # to start blind: that says why it stands
+        return Run(case.kind, case.world, scenario.seed, refuses, False, None, None, math.inf, 0, math.inf, str(error))
+    track, goal = np.array(places), np.array((scenario.goal[-1].position_m or (0.0, 0.0, 0.0))[:2])
     away = np.hypot(*(track[:, 1:3] - goal).T)
     given = float(found["goals"][-1]["at_s"]) if found["goals"] else math.inf
     said = [(name, detail) for _, name, detail in found["statuses"] if name in EXPLAINED]
@@ -141,7 +146,8 @@ def played(case: Case) -> Run:
         found["time_to_goal_s"], found["min_clearance_m"]["all"], found["contacts"], float(away[-1]),
         "; ".join([last, *found["faults"]]),
     )  # fmt: skip
-    return run._replace(fine=judged(run, bool(said) or bool(found["faults"]) or float(track[-5:, 4].max()) > 0.1))
+    moves = float(np.abs(track[-50:, 3]).max()) > 0.1
+    return run._replace(fine=judged(run, bool(said) or bool(found["faults"]) or moves))
 
 
 def judged(run: Run, explained: bool) -> bool:
