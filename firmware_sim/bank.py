@@ -130,8 +130,9 @@ class Bank:
         self._room = bytearray(16 * n)
         self._motion: F64 = np.frombuffer(self._room, dtype=np.float64).reshape(2, n)  # q, qd as the joints truly are
         self._pack = struct.Struct(f"{2 * n}d").pack_into
-        size, e2e = CANFD_MTU if fd else CAN_MTU, any(r.e2e for r in ratings)
-        self._forms: list[I64] = [np.array((size, fd, e2e, clocked), dtype=np.int64) for clocked in (False, True)]
+        self.size = CANFD_MTU if fd else CAN_MTU  # [bytes] of a raw frame
+        e2e = any(r.e2e for r in ratings)
+        self._forms: list[I64] = [np.array((self.size, fd, e2e, clocked), dtype=np.int64) for clocked in (False, True)]
 
         self._warm()
 
@@ -152,7 +153,8 @@ class Bank:
         at, replies.count, why = bank_kernels.answer(
             self.f, self.i, self._forms[clocked], came.raw, came.lengths[: came.count], first, replies.raw, before
         )
-        replies.lengths[before : replies.count] = self._forms[0][0]
+        if replies.room != self.size:
+            replies.lengths[before : replies.count] = self.size
         return at, why
 
     def actuate(self, dt_ns: int) -> bool:

@@ -266,7 +266,7 @@ def _act(f: F64, i: I64, special: int) -> None:
 def answer(F: F64, I: I64, form: I64, raw: U8, lengths: I64, first: int, out: U8, replies: int) -> tuple[int, int, int]:
     """Let the drives take raw frames from `first` on and write their replies as raw frames, from `replies` on.
 
-    raw: (m, w) a frame a row, `lengths` (m,) its bytes. out: (m + 1, size), a reply a row.
+    raw: (m, w) a frame a row, `lengths` (m,) its bytes. out: a reply a row, as wide as a frame at least.
     form: of the link: size of a raw frame, whether FD, whether protected, and whether to stop for the clock: before a
     frame to a drive that has had one in this period, and after the one that completes the period.
 

@@ -7,7 +7,7 @@ takes and gives many packets of a socket in one call (recvmmsg, sendmmsg), each 
 import ctypes
 import errno
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,12 +53,12 @@ _libc.sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.
 class _Vector:
     """Message headers whose packets are the rows of a block."""
 
-    def __init__(self, data: bytearray, capacity: int) -> None:
+    def __init__(self, data: bytearray, capacity: int, room: int) -> None:
         self._iovecs = (_Iovec * capacity)()
         self._headers = (_Mmsghdr * capacity)()
         start = ctypes.addressof(ctypes.c_char.from_buffer(data))
         for k in range(capacity):
-            self._iovecs[k].base, self._iovecs[k].size = start + k * ROOM, ROOM
+            self._iovecs[k].base, self._iovecs[k].size = start + k * room, room
             self._headers[k].header.iov = ctypes.addressof(self._iovecs[k])
             self._headers[k].header.iov_count = 1
         self.address = ctypes.addressof(self._headers)
@@ -71,39 +71,43 @@ class _Vector:
 class Batch:
     """Raw frames in order; `count` of them are valid, the first `lengths[k]` bytes of each row."""
 
-    def __init__(self, capacity: int = CAPACITY) -> None:
-        self.capacity = capacity
-        self.data = bytearray(capacity * ROOM)
-        self.raw: NDArray[np.uint8] = np.frombuffer(self.data, dtype=np.uint8).reshape(capacity, ROOM)
-        self.lengths: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
+    def __init__(self, capacity: int = CAPACITY, room: int = ROOM) -> None:
+        """`room` [bytes] of a row: more than a frame's where packets of any size may come."""
+        self.capacity, self.room = capacity, room
+        self.data = bytearray(capacity * room)
+        self.raw: NDArray[np.uint8] = np.frombuffer(self.data, dtype=np.uint8).reshape(capacity, room)
+        self.lengths: NDArray[np.int64] = np.full(capacity, room, dtype=np.int64)
         self.count = 0
-        self._sizes: list[int] = []  # of the first frames, as `extend` has left them in `lengths`
-        self._coming, self._going = _Vector(self.data, capacity), _Vector(self.data, capacity)
+        self._coming, self._going = _Vector(self.data, capacity, room), _Vector(self.data, capacity, room)
 
-    def extend(self, frames: Sequence[bytes]) -> None:
+    def load(self, frames: Sequence[bytes]) -> None:
+        """Replace all by frames that fill their rows, in a batch of such rows."""
+        self.count = len(frames)
+        self.data[: self.count * self.room] = b"".join(frames)
+
+    def unload(self) -> list[bytes]:
+        """Return all of them from a batch of rows that frames fill."""
+        room = self.room
+        data = bytes(self.data[: self.count * room])
+        return [data[k : k + room] for k in range(0, len(data), room)]
+
+    def extend(self, frames: Iterable[bytes]) -> None:
         """Add frames; what has no room is left out."""
-        start = self.count
-        frames = frames[: self.capacity - start]
-        sizes = [len(raw) for raw in frames]
-        if SIZES.issuperset(sizes):
-            rows = [raw.ljust(ROOM) for raw in frames]
-        else:
-            rows = [raw[:ROOM].ljust(ROOM) for raw in frames]
-        self.count = end = start + len(frames)
-        self.data[start * ROOM : end * ROOM] = b"".join(rows)
-        if start or sizes != self._sizes:  # a cycle is as the one before
-            self.lengths[start:end] = sizes
-            self._sizes = [] if start else sizes
+        room = self.room
+        for raw in frames:
+            if self.count == self.capacity:
+                break
+            self.lengths[self.count] = len(raw)
+            self.data[self.count * room : (self.count + 1) * room] = raw[:room].ljust(room)
+            self.count += 1
 
     def frame(self, k: int) -> bytes:
         """Return one frame."""
-        return bytes(self.data[k * ROOM : k * ROOM + min(int(self.lengths[k]), ROOM)])
+        return bytes(self.data[k * self.room : k * self.room + min(int(self.lengths[k]), self.room)])
 
     def frames(self) -> list[bytes]:
         """Return all of them."""
-        data = bytes(self.data[: self.count * ROOM])
-        ends = self.lengths[: self.count].tolist()
-        return [data[k * ROOM : k * ROOM + size] for k, size in enumerate(ends)]
+        return [self.frame(k) for k in range(self.count)]
 
     def take(self, fd: int, limit: int = CAPACITY) -> bool:
         """Add the frames that wait on a socket, at most `limit`; return whether its connection stands.
@@ -118,7 +122,6 @@ class Batch:
             if code in (errno.EAGAIN, errno.EINTR):
                 return True
             raise OSError(code, "recvmmsg")
-        self._sizes = []
         self.lengths[start : start + came] = self._coming.lengths[start : start + came]
         sizes = self.lengths[start : start + came].tolist()
         if SIZES.issuperset(sizes):

@@ -229,7 +229,8 @@ class Plant:
         """Return position [m] and orientation wxyz of the tip frame."""
         state = pb.getLinkState(self.body, self.tip, computeForwardKinematics=1, physicsClientId=self.client)
         x, y, z, w = state[5]
-        return np.array(state[4]), np.array([w, x, y, z])
+        pose = np.array((*state[4], w, x, y, z))
+        return pose[:3], pose[3:]
 
     def close(self) -> None:
         """Leave pybullet."""

@@ -61,7 +61,8 @@ class Simulator:
         self.plant = Plant(settings, start_q, obstacles)
         self.started = not wait
         self.exact = True  # whether every truth tells exact clearances; else their least over the run alone are exact
-        self._came, self._replies = Batch(), Batch(REPLIES)
+        self._size = frozenset((self.bank.size,))
+        self._came, self._replies = Batch(CAPACITY, self.bank.size), Batch(REPLIES, self.bank.size)
         self._steps = 0
         self._shown: set[str] = set()
         self._truth: Truth | None = None
@@ -80,12 +81,13 @@ class Simulator:
 
     def exchange(self, frames: list[bytes]) -> list[bytes]:
         """Take the frames of one servo period, return the replies, advance one period (but for register frames)."""
-        said: list[bytes] = []
-        for start in range(0, len(frames), CAPACITY):
-            self._came.count = self._replies.count = 0
-            self._came.extend(frames[start : start + CAPACITY])
+        if len(frames) <= CAPACITY and self._size.issuperset(map(len, frames)):
+            self._came.load(frames)
+            self._replies.count = 0
             self.answer(self._came, self._replies)
-            said += self._replies.frames()
+            said = self._replies.unload()
+        else:
+            said = [reply for raw in frames for reply in self.wire.answer_one(self.plant.scene_ns, raw)]
         if not frames or not all(map(of_registers, frames)):
             self.advance()
         return said
