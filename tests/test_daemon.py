@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtctl.arm.servo_level import REST_SPEED
+from rtctl.arm.sensing import REST_SPEED
 from rtctl.errors import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from rtctl.log.schema import TX
 from rtctl.protocol import mit

@@ -81,7 +81,7 @@ def fly(obstacles: Obstacles, seconds: float, escaping: bool = True) -> Flight:
         elif s.phase == Phase.CHOOSING:
             s = escape.chosen(s, model, x, ASKED, obstacles, START, 3.0, 0.1, 0.02)
         elif s.phase != Phase.NONE:
-            s = escape.advanced(s, e, push, bool(np.linalg.norm(xd) < 0.01), DT)
+            s = escape.advance(s._replace(phase=int(s.phase)), e, push, bool(np.linalg.norm(xd) < 0.01), DT)
         if s.active:
             e = escape.way(s.n, s.b, push, MOTION)
         d = float(np.linalg.norm(e))

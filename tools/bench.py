@@ -39,7 +39,8 @@ STAGES = {
     "servo": "servo level, a call",
     "_evaluated": "parameter level",
     "_perceived": "edit obstacles",
-    "_decided": "supervise, take goals",
+    "supervised": "supervise",
+    "with_goal": "take goals",
     "_diagnosed": "diagnose",
 }
 FULL = {"law": 4000, "tick": 10000, "call": 3000, "wake": 5000, "log": 10, "demo": 60}

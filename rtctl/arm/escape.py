@@ -112,12 +112,6 @@ def advance(s: Escape, e: F64, push: F64, still: bool, dt: float) -> Escape:
     return Escape(_GIVEN_UP, s.hit, n, s.b, s.costs, 0, 0)
 
 
-def advanced(s: Escape, e: F64, push: F64, still: bool, dt: float) -> Escape:
-    """Return `advance` of an escape whose phase is a Phase."""
-    s = advance(s._replace(phase=int(s.phase)), e, push, bool(still), dt)
-    return s._replace(phase=Phase(s.phase))
-
-
 @kernel
 def way(n: F64, b: F64, push: F64, motion: MotionParams) -> F64:
     """Return the error (3,) [m] that sends the tip at SPEED v_max across the push and a little against it.

@@ -203,6 +203,15 @@ def prepared(robot: Robot) -> Robot:
 
 
 @kernel
+def motion_params(c: Any) -> MotionParams:
+    """Return the parameters of the motion task in the record c; what it has of joints is padded."""
+    return MotionParams(
+        c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max, c.motion_k_q,
+        c.motion_d_q, c.motion_qdd_posture, c.motion_epsilon, c.motion_length, c.motion_speed_margin,
+    )  # fmt: skip
+
+
+@kernel
 def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
     """Return the parameters that `prepared` put into the record c."""
     return (

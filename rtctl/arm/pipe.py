@@ -6,7 +6,7 @@ block diagram is `tick`; each block is a function below it or a module beside it
 
 import numpy as np
 
-from rtctl.arm import diagnosis, escape, progress
+from rtctl.arm import diagnosis, escape
 from rtctl.arm.escape import Escape
 from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
@@ -18,25 +18,22 @@ from rtctl.arm.record import record_dtype
 from rtctl.arm.robot import Robot
 from rtctl.arm.servo_level import (
     ATTENTION,
+    CHOSEN,
     DECIDED,
-    DIAGNOSE,
     MEASURED,
     MISSED_MAX,
     MODEL,
     MOVED,
     REQUEST,
     START,
-    START_PACE,
-    WORDS,
     WORLD,
     Arm,
     Asked,
-    pursues,
     servo,
 )
 from rtctl.arm.session import hold_at, supervised, with_goal
-from rtctl.arm.task import between, point_of, selected
-from rtctl.kernel import reductions
+from rtctl.arm.target import DIAGNOSE, START_PACE, WORDS, pursues
+from rtctl.arm.task import between, point_of
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.types import (
     F64,
@@ -85,7 +82,10 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
         )
     if flags & ATTENTION:
         m = Memory(hot, robot.n, verdict, held, model, parameters, placed, table, shapes)
-        m = _decided(robot, m, feedback, request)
+        m = supervised(robot, m, feedback, request, m.present)
+        m = with_goal(robot, m, request)
+        if pursues(m.hot[0]) and m.escape.phase == escape.Phase.CHOOSING:
+            m, bits = _with_side(robot, m), bits | CHOSEN
         verdict, held = m.verdict, m.held
         hot, table, raw, flags = servo(
             arm, m.hot, parameters, m.table, m.shapes, clouds, f, Asked(DECIDED, bits, verb, creep, stale)
@@ -133,30 +133,17 @@ def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) ->
     return m._replace(world=table, verdict=verdict)
 
 
-def _decided(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> Memory:
-    """Return the memory after what is rare: the supervisor's events, a new goal, the side of an escape."""
-    m = supervised(robot, m, feedback, request, m.present)
-    m = with_goal(robot, m, request)
-    return _escaping(robot, m) if pursues(m.hot[0]) else m
-
-
-def _escaping(robot: Robot, m: Memory) -> Memory:
-    """Return the memory with the escape from a local minimum a tick further."""
-    s, goal = m.escape, m.goal
-    if goal is None or s.phase == escape.Phase.NONE:
-        return m
-    to = point_of(goal, m.tip.x)
-    if s.phase == escape.Phase.CHOOSING:
-        s = escape.chosen(
-            s, m.model, m.tip.x, goal._replace(position=to), m.world.obstacles, robot.base, robot.reach,
-            robot.avoid.rho0, robot.motion.epsilon,
-        )  # fmt: skip
-        return m._replace(escape=s)
-    v, _ = selected(int(goal.task), goal.axis, m.tip.R, m.tip.xd, m.tip.omega)
-    push = escape.push_of(m.model, m.tau_obstacles, goal)
+def _with_side(robot: Robot, m: Memory) -> Memory:
+    """Return the memory with the choice of the side of an escape a tick further."""
+    goal = m.goal
+    assert goal is not None
+    to = goal._replace(position=point_of(goal, m.tip.x))
     return m._replace(
-        escape=escape.advanced(s, to - m.tip.x, push, reductions.norm(v) < progress.STILL_SPEED, robot.dt)
-    )
+        escape=escape.chosen(
+            m.escape, m.model, m.tip.x, to, m.world.obstacles, robot.base, robot.reach, robot.avoid.rho0,
+            robot.motion.epsilon,
+        )
+    )  # fmt: skip
 
 
 def _diagnosed(robot: Robot, m: Memory, before: Memory, record: Record) -> Memory:

@@ -45,6 +45,12 @@ def largest(values: F64) -> float:
 
 
 @kernel
+def greater(a: float, b: float) -> float:
+    """Return the greater; a NaN that comes first stays, so that it is seen."""
+    return b if b > a else a
+
+
+@kernel
 def norm(v: F64) -> float:
     """Return the Euclidean length."""
     s = 0.0
