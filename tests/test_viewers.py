@@ -183,7 +183,8 @@ def test_a_rovers_log_shows_it_where_it_was_with_its_goal_its_way_and_what_it_sa
             assert drawn["goal"].cylinders[0].pose.position.x == pytest.approx(40.0)
             corners = drawn["way"].lines[0].points
             assert corners[0].x == pytest.approx(ticks.x[row, 0])
-            assert corners[-1].x == pytest.approx(40.0, abs=0.5)
+            if np.isfinite(ticks.way_length[row]):  # none is known while it looks for one
+                assert corners[-1].x == pytest.approx(40.0, abs=0.5)
     seen = [(s.pose.position.x, s.pose.position.y) for _, _, m in scenes for e in m.entities if e.id == "scan"
             for s in e.spheres]  # fmt: skip
     away = np.abs(np.hypot(*(np.array(seen) - (20.0, 0.0)).T) - 2.0)

@@ -48,11 +48,11 @@ class VcanError(Exception):
 class Venue(NamedTuple):
     """Where a command would meet vcan0: beside an existing one, in a namespace, in a guest or nowhere."""
 
-    kind: Literal["here", "namespace", "guest", "none"]
+    kind: Literal["here", "namespace", "guest", "none", "never"]  # never: no install would cure it
     reason: str
 
     def __bool__(self) -> bool:
-        return self.kind != "none"
+        return self.kind not in ("none", "never")
 
 
 @functools.cache
@@ -66,10 +66,20 @@ def available() -> Venue:
     missing = [tool for tool in (KERNEL, "insmod", "ip", "unshare") if _which(tool) is None]
     if not missing and not list(MODULES.glob("*/kernel/drivers/net/can/vcan.ko")):
         missing = [f"{MODULES}/*/kernel/drivers/net/can/vcan.ko"]
+    if _state_too_large():
+        return Venue(
+            "never", f"no AF_CAN here, and a {KERNEL} guest cannot save this processor's AMX registers: it dies"
+        )
     if not missing:
         return Venue("guest", f"a {KERNEL} guest")
     why = f"{CHANNEL} may not be created" if native else "this kernel has no AF_CAN"
     return Venue("none", f"{why} and a guest lacks {', '.join(missing)}: as root run `{INSTALL}`")
+
+
+def _state_too_large() -> bool:
+    """Return whether user-mode Linux dies here at its first process: its room for registers ends before AMX tiles."""
+    cpuinfo = Path("/proc/cpuinfo")
+    return cpuinfo.exists() and " amx_tile" in cpuinfo.read_text()
 
 
 def run(

@@ -115,9 +115,12 @@ def started(session: pytest.Session) -> Results:
 
 
 def require() -> vcan.Venue:
-    """Where vcan0 can be had; else skips with the reason and the install command, or fails where CI=true."""
+    """Where vcan0 can be had; else skips with the reason and the install command, or fails where CI=true.
+
+    What no install cures, a processor that the guest cannot run on, is skipped there, too.
+    """
     venue = vcan.available()
-    if not venue and os.environ.get("CI") == "true":
+    if not venue and venue.kind != "never" and os.environ.get("CI") == "true":
         pytest.fail(venue.reason, pytrace=False)
     if not venue:
         pytest.skip(venue.reason)
