@@ -15,7 +15,7 @@ from rtctl.log import Kind, McapSink, make_header, read, read_run, segments
 from rtctl.log.entry import Batch
 from rtctl.log.header import header_to_json
 from rtctl.log.mcap.names import Origin, origin_of
-from rtctl.log.record import health, recorder
+from rtctl.log.record import health, recorder, writer
 from rtctl.log.record.health import DropWatch, Repeats
 from rtctl.log.record.recorder import Recorder
 from rtctl.log.record.retention import old_segments
@@ -150,6 +150,15 @@ def test_the_floor_deletes_a_month_from_its_beginning(month: Path):
 
 
 # ---- sessions and clocks
+
+
+def test_a_turn_that_two_segments_share_has_one_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    offsets = iter([5_000_000_000, 5_000_000_007, 5_000_999_999, 6_000_000_000])
+    monkeypatch.setattr(writer, "clock_offset", lambda: next(offsets))
+    session(tmp_path, "arm", 4)
+    logs = [read(path) for path in segments(tmp_path / "arm.000.mcap")]
+    assert [log.offset for log in logs] == [5_000_000_000] * 3 + [6_000_000_000]
+    assert logs[1]["/event"].time.tolist() == [5_000_003_000, 5_000_004_000]
 
 
 def test_a_session_at_1970_is_behind_yesterday_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

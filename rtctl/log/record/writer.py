@@ -19,6 +19,7 @@ from rtctl.log.record.encoding import Encoder
 from rtctl.log.record.retention import Retention, session_order
 
 CHUNK_TIME = 0.25  # [s] after which a chunk is written however small
+JITTER_NS = 1_000_000  # of the clocks' offset, as it is read: less is no change
 SYNC_TIME = 1.0  # [s]
 RESERVE = 512 << 10  # [bytes] kept aside so that a full disk still takes the end of the file
 REOPEN = 64 << 20  # [bytes] above the floor before a session that met a full disk writes again
@@ -100,7 +101,9 @@ class Session:
         """Begin the next segment, or become degraded."""
         now = time.monotonic()
         self._opened = self._flushed = self._synced = now
-        self.encoder.offset = clock_offset()
+        offset = clock_offset()
+        if abs(offset - self.encoder.offset) > JITTER_NS:  # else a turn that two files share would have two times
+            self.encoder.offset = offset
         stamp = time.monotonic_ns() + self.encoder.offset
         try:
             self.options.directory.mkdir(parents=True, exist_ok=True)
