@@ -264,6 +264,19 @@ def test_messages_of_a_channel_that_is_lost_do_not_spoil_the_rest(tmp_path: Path
     assert (done.code, done.messages, done.independent) == (LOSSY, 1, 1)
 
 
+def test_a_chunk_whose_length_has_64_bits_is_not_believed(tmp_path: Path):
+    sink = McapSink(tmp_path / "a.mcap", make_header("r", ("a",), 2, 1e-3))
+    sink.put(Kind.EVENT, b"{}", 1)
+    raw = bytearray(sink.close().read_bytes())
+    at = raw.index(b"\x04\0\0\0zstd") - 28 - 9  # of the chunk's record
+    assert raw[at] == CHUNK
+    raw[at + 8] |= 0x80
+    (tmp_path / "b.mcap").write_bytes(raw)
+    assert info(tmp_path / "b.mcap")["topics"] == {}
+    with pytest.raises(LogError):
+        _ = read(tmp_path / "b.mcap")["/nothing"]
+
+
 def test_damaged_files_give_no_traceback(tmp_path: Path):
     """`python -m tools.damage` does it by the ten thousand."""
     assert damage.campaign(tmp_path, 60, seed=5) == []

@@ -165,7 +165,7 @@ def _chunk_indices(data: Source, places: list[int]) -> Chunks:
     body, end = at.astype(np.int64) + RECORD.size, (at + length).astype(np.int64)
     for k in np.unique(np.linspace(0, len(chunks) - 1, LOOKED_AT + 1).astype(int)).tolist():
         opcode, inner = RECORD.unpack_from(data, int(at[k])) if at[k] <= len(data) - RECORD.size else (0, 0)
-        if opcode != Opcode.CHUNK or body[k] + inner != end[k]:
+        if opcode != Opcode.CHUNK or int(body[k]) + inner != int(end[k]):
             raise Damaged("chunk index: no chunk where it points")
     indices = np.minimum(table["offset"], np.uint64(I64_MAX)).astype(np.int64)
     return Chunks(body, end, head["start"], head["end"], owner, table["channel"].astype(np.int64), indices)
