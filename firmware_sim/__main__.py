@@ -20,6 +20,7 @@ from firmware_sim.camera import Camera
 from firmware_sim.codec import REGISTER_ID
 from firmware_sim.drive import NS
 from firmware_sim.inject import KINDS
+from firmware_sim.kernel import cold
 from firmware_sim.report import Report
 from firmware_sim.rover import is_rover, open_rover
 from firmware_sim.rover_serve import serve
@@ -231,6 +232,8 @@ def run(args: argparse.Namespace) -> None:
     if is_rover(args.config):
         serve(open_rover(args.config, scenario, args.inject, not args.now, args.seed), args.config, args.report)
         return
+    if cold():
+        print("firmware_sim: compiles its drives, at this first start", file=sys.stderr, flush=True)
     simulator = open_simulator(args.config, scenario, None, args.seed, None, args.inject, wait=not args.now)
     simulator.exact = False  # the report tells the least distances alone
     settings = simulator.settings

@@ -33,6 +33,11 @@ def _folder() -> Path:
 _FOLDER = str(_folder())
 
 
+def cold() -> bool:
+    """Tell whether nothing is compiled yet: the first start of these sources takes some seconds more."""
+    return not os.path.isdir(_FOLDER)
+
+
 def kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile a function that is also valid plain Python; sums keep their order, so equal inputs give equal bits."""
     base, _settings.CACHE_DIR = _settings.CACHE_DIR, _FOLDER
