@@ -18,8 +18,8 @@ from rtctl.types import B1, F64, I64
 from rtctl.world.primitives import Obstacles
 
 TABLE = 16  # numbers of a slot in the table: p 3, R 9, margin, age, rho, goal_rho
-SHAPES = 15  # and in the shapes: kind, active, moving, group, v 3, w 3, dims 5
-CLOUDS = tuple[F64, F64, F64, F64]
+SHAPES = 15  # and in the shapes: kind, active, moving, group, v 3, w 3, dims 5; then creep and stale of them all
+BODIES = tuple[F64, tuple[F64, F64, F64, F64]]  # mesh and clouds of `Obstacles`
 
 
 @kernel
@@ -82,16 +82,17 @@ def model_in(p: F64, n: int, m: int) -> tuple[Model, OperationalSpace]:
 
 
 @kernel
-def shapes_of(obstacles: Obstacles, moving: B1) -> F64:
-    """Return the shapes of the obstacles; moving (K,): whether their observation grows stale."""
+def shapes_of(obstacles: Obstacles, moving: B1, creep: float, stale: float) -> F64:
+    """Return the shapes of the obstacles; moving (K,), creep [m/s], stale [s]: of `obstacle_table.World`."""
     slots = moving.shape[0]
-    out = np.empty(SHAPES * slots)
+    out = np.empty(SHAPES * slots + 2)
     for k in range(slots):
         out[k], out[slots + k] = obstacles.kind[k], 1.0 if obstacles.active[k] else 0.0
         out[2 * slots + k], out[3 * slots + k] = 1.0 if moving[k] else 0.0, obstacles.group[k]
     at = _put(out, 4 * slots, obstacles.v)
     at = _put(out, at, obstacles.w)
-    _put(out, at, obstacles.dims)
+    at = _put(out, at, obstacles.dims)
+    out[at], out[at + 1] = creep, stale
     return out
 
 
@@ -107,7 +108,7 @@ def table_of(obstacles: Obstacles, age: F64, rho: F64, goal_rho: F64) -> F64:
 
 
 @kernel
-def obstacles_in(t: F64, shapes: F64, mesh: F64, clouds: CLOUDS) -> tuple[Obstacles, B1]:
+def obstacles_in(t: F64, shapes: F64, bodies: BODIES) -> tuple[Obstacles, B1]:
     """Return the obstacles in a table and their shapes, and which of them move (K,)."""
     slots = t.shape[0] // TABLE
     kind, group = np.empty(slots, np.int64), np.empty(slots, np.int64)
@@ -115,11 +116,11 @@ def obstacles_in(t: F64, shapes: F64, mesh: F64, clouds: CLOUDS) -> tuple[Obstac
     for k in range(slots):
         kind[k], group[k] = int(shapes[k]), int(shapes[3 * slots + k])
         active[k], moving[k] = shapes[slots + k] != 0.0, shapes[2 * slots + k] != 0.0
-    v, w, dims = shapes[4 * slots : 7 * slots], shapes[7 * slots : 10 * slots], shapes[10 * slots :]
+    v, w, dims = shapes[4 * slots : 7 * slots], shapes[7 * slots : 10 * slots], shapes[10 * slots : 15 * slots]
     return Obstacles(
         kind, active, t[3 * slots : 12 * slots].reshape(slots, 3, 3), t[: 3 * slots].reshape(slots, 3),
-        v.reshape(slots, 3), w.reshape(slots, 3), dims.reshape(slots, 5), group, t[12 * slots : 13 * slots], mesh,
-        clouds,
+        v.reshape(slots, 3), w.reshape(slots, 3), dims.reshape(slots, 5), group, t[12 * slots : 13 * slots],
+        bodies[0], bodies[1],
     ), moving  # fmt: skip
 
 

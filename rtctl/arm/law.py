@@ -15,7 +15,7 @@ from rtctl.arm.flat import field_in, field_sizes
 from rtctl.arm.guards import approach_rows, fitting, guarded, joint_bounds, tip_row, yielding
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
-from rtctl.arm.robot import JOINTS_MAX, Robot
+from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
 from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec
 from rtctl.types import F64, I32, I64, Cut, Record
@@ -199,7 +199,8 @@ def prepared(robot: Robot) -> Robot:
     m = len(robot.points.radius)
     reals, wholes = field_sizes(robot.slots, m, robot.n)
     work = np.zeros(reals), np.zeros(wholes, np.int64)
-    return robot._replace(constants=constants, work=work, scratch=field_in(*work, robot.n, m))
+    arm = Arm(constants, robot.points.radius, robot.points.link, *work)
+    return robot._replace(constants=constants, arm=arm, scratch=field_in(*work, robot.n, m))
 
 
 @kernel

@@ -12,7 +12,7 @@ from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import parameters_of, shapes_of, table_of
 from rtctl.arm.law import REVIEW
-from rtctl.arm.memory import Memory, fresh
+from rtctl.arm.memory import Memory, fresh, record_of
 from rtctl.arm.model import Model
 from rtctl.arm.record import record_dtype
 from rtctl.arm.robot import Robot
@@ -27,8 +27,7 @@ from rtctl.arm.servo_level import (
     REQUEST,
     START,
     WORLD,
-    Arm,
-    Asked,
+    asking,
     servo,
 )
 from rtctl.arm.session import hold_at, supervised, with_goal
@@ -63,41 +62,34 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
 
     feedback: the drives' replies of this slot; request: what operators and sensors sent since the previous tick.
     """
-    f = feedback._replace(link=int(feedback.link))
-    arm = Arm(robot.constants, robot.points.radius, robot.points.link, *robot.work, robot.meshes.data)
+    f = feedback if type(feedback.link) is int else feedback._replace(link=int(feedback.link))
     bits, verb, m = REQUEST if request.verb or request.goal is not None else 0, int(request.verb), memory
+    held, verdict = memory.held, ""
     if request.obstacles:
-        m, bits = _perceived(robot, m, feedback, request), bits | WORLD
-    model, parameters, placed, shapes = m.model, m.parameters, m.placed, m.shapes
-    clouds, creep, stale = placed.obstacles.clouds, placed.creep, placed.stale
-    held, verdict = m.held, m.verdict if request.obstacles else ""
-    hot, table, raw, flags = servo(
-        arm, m.hot, parameters, m.table, shapes, clouds, f, Asked(START, bits, verb, creep, stale)
-    )
+        m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
+        verdict = m.verdict
+    arm, model, parameters, placed, shapes = robot.arm, m.model, m.parameters, m.placed, m.shapes
+    bodies = placed.obstacles.mesh, placed.obstacles.clouds
+    hot, table, raw, flags = servo(arm, m.hot, parameters, m.table, shapes, bodies, f, asking(START, bits, verb))
     if flags & MODEL:
         model, parameters = _evaluated(robot, hot, model)
         bits |= WORLD if flags & MOVED else 0
-        hot, table, raw, flags = servo(
-            arm, hot, parameters, table, shapes, clouds, f, Asked(MEASURED, bits, verb, creep, stale)
-        )
+        hot, table, raw, flags = servo(arm, hot, parameters, table, shapes, bodies, f, asking(MEASURED, bits, verb))
     if flags & ATTENTION:
         m = Memory(hot, robot.n, verdict, held, model, parameters, placed, table, shapes)
-        m = supervised(robot, m, feedback, request, m.present)
-        m = with_goal(robot, m, request)
-        if pursues(m.hot[0]) and m.escape.phase == escape.Phase.CHOOSING:
-            m, bits = _with_side(robot, m), bits | CHOSEN
-        verdict, held = m.verdict, m.held
+        m, chosen = _decided(robot, m, feedback, request)
+        hot, table, held, verdict = m.hot, m.table, m.held, m.verdict
         hot, table, raw, flags = servo(
-            arm, m.hot, parameters, m.table, m.shapes, clouds, f, Asked(DECIDED, bits, verb, creep, stale)
+            arm, hot, parameters, table, shapes, bodies, f, asking(DECIDED, bits | chosen, verb)
         )
     if not robot.carry:
-        model = model._replace(q=hot["q"][0, : robot.n])  # the points have not moved either
+        model = model._replace(q=record_of(hot)["q"][0, : robot.n])  # the points have not moved either
     m = Memory(hot, robot.n, verdict, () if flags & WORDS else held, model, parameters, placed, table, shapes)
-    record = raw.view(record_dtype(robot.n, robot.slots))
+    record = np.frombuffer(raw, record_dtype(robot.n, robot.slots))
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
     record.flags.writeable = False
-    return m, Command(DRIVES[record["command"].item()], hot["sent"][0, 0, : robot.n]), record
+    return m, Command(DRIVES[record["command"].item()], record_of(hot)["sent"][0, 0, : robot.n]), record
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
@@ -108,7 +100,10 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     table = obstacle_table.with_static(table, robot.obstacles)
     far = np.full(robot.slots, np.inf)
     parameters = parameters_of(model, int(robot.axes), TOOL_Z, robot.motion)
-    shapes, places = shapes_of(table.obstacles, table.moving), table_of(table.obstacles, table.age, far, far)
+    shapes, places = (
+        shapes_of(table.obstacles, table.moving, table.creep, table.stale),
+        table_of(table.obstacles, table.age, far, far),
+    )
     return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes)._replace(
         tick=-1, state=State.IDLE, since=-1, good=np.full(len(FAULTS), 1 << 30), clear_until=-1,
         joints=joint_start(q, robot.joint_P), tip=start(model.x, model.R, robot.tip_design),
@@ -118,9 +113,9 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     )  # fmt: skip
 
 
-def _evaluated(robot: Robot, hot: Record, model: Model) -> tuple[Model, F64]:
+def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
     """Return the model at the joints of a hot record if one is due, and the parameters of its task."""
-    h, n = hot[0], robot.n
+    h, n = record_of(hot)[0], robot.n
     if h["evaluated"]:
         model = robot.body.evaluate(h["q"][:n], h["qd"][:n], robot.points, robot.own)
     return model, parameters_of(model, int(h["task"]), h["axis"], robot.motion)
@@ -131,6 +126,15 @@ def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) ->
     elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
     table, verdict = obstacle_table.edited(obstacle_table.advanced(m.world, elapsed), request.obstacles)
     return m._replace(world=table, verdict=verdict)
+
+
+def _decided(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> tuple[Memory, int]:
+    """Return the memory after what is rare: the supervisor's events, a new goal, the side of an escape (CHOSEN)."""
+    m = supervised(robot, m, feedback, request, m.present)
+    m = with_goal(robot, m, request)
+    if pursues(record_of(m.hot)[0]) and m.escape.phase == escape.Phase.CHOOSING:
+        return _with_side(robot, m), CHOSEN
+    return m, 0
 
 
 def _with_side(robot: Robot, m: Memory) -> Memory:
@@ -149,7 +153,7 @@ def _with_side(robot: Robot, m: Memory) -> Memory:
 def _diagnosed(robot: Robot, m: Memory, before: Memory, record: Record) -> Memory:
     """Level of competence: what holds an arm that rests or creeps; written into the record, too."""
     m = _blocked(robot, m, before, record)
-    h = m.hot[0]
+    h = record_of(m.hot)[0]
     record["status"], record["blocker"], record["holders"] = h["status"], h["blocker"], h["holders"]
     record["escape"] = h["escape_phase"]
     return m

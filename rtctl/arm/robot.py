@@ -27,6 +27,16 @@ class StopParams(NamedTuple):
     stall: float  # [s] at rest short of the goal before it is diagnosed
 
 
+class Arm(NamedTuple):
+    """The robot as the servo level takes it, in few flat arrays; see `law.prepared`."""
+
+    constants: Record
+    radius: F64  # (m,) [m] of the PSPs
+    link: I64  # (m,)
+    reals: F64  # the memory of `Robot.scratch`; see `flat.field_in`
+    wholes: I64
+
+
 class Robot(NamedTuple):
     """Everything `tick` may know of the arm that does not change."""
 
@@ -71,5 +81,5 @@ class Robot(NamedTuple):
     axes: Task = Task.POSE  # of the tip that the arm can move
     meshes: Meshes = NONE  # that obstacles may refer to
     carry: bool = True  # tip and points are estimated between evaluations; else held still
-    work: tuple[F64, I64] = (np.zeros(0), np.zeros(0, np.int64))  # the memory of `scratch`; see `flat.field_in`
+    arm: Arm = Arm(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
     constants: Record = np.zeros(0)  # what the law needs of the above in one record; see `law.prepared`

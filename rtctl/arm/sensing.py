@@ -37,6 +37,8 @@ class Surroundings(NamedTuple):
     age: F64  # (K,) [s] since each was observed
     rho: F64  # (K,) [m] from the arm to each, of the previous tick
     goal_rho: F64  # (K,) [m] from the goal to each
+    creep: float  # [m/s] speed that obstacles may have beside the one that is told
+    stale: float  # [s] age at which an observation is too old
 
 
 @kernel

@@ -12,19 +12,21 @@ import numpy as np
 
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import STOPS
-from rtctl.arm.flat import AGE, CLOUDS, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
+from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, _evaluate
 from rtctl.arm.limits import command_torque
+from rtctl.arm.memory import HOT
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
+from rtctl.arm.robot import Arm
 from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torque, plausible_feedback, predict
 from rtctl.arm.target import progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
-from rtctl.types import F64, I64, U8, Drive, Feedback, Record, Severity, State, Task
+from rtctl.types import F64, U8, Drive, Feedback, Severity, State, Task
 from rtctl.world.obstacle_table import distances_from, margins
 from rtctl.world.primitives import advanced_pose
 
@@ -52,25 +54,17 @@ _DISABLE, _ENABLE, _TORQUE, _CLEAR = (int(d) for d in (Drive.DISABLE, Drive.ENAB
 _SS1, _POSITION, _CHOOSING = int(Severity.SS1), int(Task.POSITION), int(Phase.CHOOSING)
 
 
-class Arm(NamedTuple):
-    """What the servo level knows of the robot; see `law.prepared`."""
-
-    constants: Record
-    radius: F64  # (m,) [m] of the PSPs
-    link: I64  # (m,)
-    reals: F64  # work arrays; see `flat.field_in`
-    wholes: I64
-    mesh: F64  # bodies of the robot's meshes
-
-
 class Asked(NamedTuple):
-    """What is asked of a call."""
+    """What is asked of a call; it crosses as one number, see `asking`."""
 
     stage: int  # where it begins: START, MEASURED, DECIDED
-    bits: int  # REQUEST | WORLD
+    bits: int  # REQUEST | WORLD | CHOSEN
     verb: int  # types.Verb, for the record
-    creep: float  # [m/s] speed that obstacles may have beside the one that is told
-    stale: float  # [s] age at which an observation is too old
+
+
+def asking(stage: int, bits: int, verb: int) -> int:
+    """Return the number that stands for an Asked."""
+    return stage | bits << 2 | verb << 8
 
 
 @kernel
@@ -113,14 +107,14 @@ def _damped_stop(c: Any, m: Any, f: Feedback, g: F64) -> F64:
 
 
 @kernel
-def _move(around: Surroundings, asked: Asked, dt: float) -> None:
+def _move(around: Surroundings, dt: float) -> None:
     """Move the obstacles of the table on by dt [s], their observations grow older."""
     o = around.obstacles
     o.p[:], o.R[:] = advanced_pose(o.active, o.p, o.R, o.v, o.w, dt)
     for k in range(around.age.shape[0]):
         if around.moving[k]:
             around.age[k] += dt
-    o.margin[:] = margins(o.margin, around.age, around.moving, asked.creep, asked.stale, dt)
+    o.margin[:] = margins(o.margin, around.age, around.moving, around.creep, around.stale, dt)
 
 
 @kernel
@@ -132,7 +126,7 @@ def _sense(c: Any, m: Any, f: Feedback, model: Model, around: Surroundings, aske
         m.tick = m.tick + 1
         elapsed = c.dt * (1 + min(f.missed, MISSED_MAX))
         if asked.bits & WORLD == 0 and any_set(around.moving):
-            _move(around, asked, elapsed)
+            _move(around, elapsed)
             moved = MOVED
         if predict(c, m, plausible, model, elapsed):
             return MODEL | moved
@@ -203,23 +197,26 @@ def _act(
 
 @kernel
 def servo(
-    arm: Arm, before: Record, parameters: F64, table_before: F64, shapes: F64, clouds: CLOUDS, feedback: Feedback,
-    asked: Asked,
-) -> tuple[Record, F64, U8, int]:  # fmt: skip
-    """Run the servo level of one tick from `asked.stage` on, or until Python is needed.
+    arm: Arm, before: F64, parameters: F64, table_before: F64, shapes: F64, bodies: BODIES, feedback: Feedback,
+    asked: int,
+) -> tuple[F64, F64, U8, int]:  # fmt: skip
+    """Run the servo level of one tick from a stage on, or until Python is needed.
 
-    parameters, table_before, shapes, clouds: see `flat`. Returns the memory, the table, the bytes of the tick's record,
-    and flags: DONE | WORDS when it is over; MODEL: evaluate the model at the joints of the memory where its `evaluated`
-    says so, and the task space, then go on at MEASURED; ATTENTION: supervise, then go on at DECIDED; DIAGNOSE: the tick
-    is over but for what holds the arm. MOVED: the obstacles are elsewhere than they were.
+    before: the memory, see `memory.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.
+    Returns the memory, the table, the bytes of the tick's record, and flags: DONE | WORDS when it is over; MODEL:
+    evaluate the model at the joints of the memory where its `evaluated` says so, and the task space, then go on at
+    MEASURED; ATTENTION: supervise, then go on at DECIDED; DIAGNOSE: the tick is over but for what holds the arm. MOVED:
+    the obstacles are elsewhere than they were.
     """
-    memory, table = before.copy(), table_before.copy()
-    m = memory[0]
+    memory, table, wish = before.copy(), table_before.copy(), Asked(asked & 3, asked >> 2 & 63, asked >> 8)
+    m = memory.view(HOT)[0]
     model, space = model_in(parameters, feedback.q.shape[0], arm.radius.shape[0])
-    obstacles, moving = obstacles_in(table, shapes, arm.mesh, clouds)
-    around = Surroundings(obstacles, moving, row_of(table, AGE), row_of(table, RHO), row_of(table, GOAL_RHO))
-    flags = _sense(arm.constants[0], m, feedback, model, around, asked) if asked.stage != DECIDED else DONE
+    obstacles, moving = obstacles_in(table, shapes, bodies)
+    around = Surroundings(
+        obstacles, moving, row_of(table, AGE), row_of(table, RHO), row_of(table, GOAL_RHO), shapes[-2], shapes[-1]
+    )
+    flags = _sense(arm.constants[0], m, feedback, model, around, wish) if wish.stage != DECIDED else DONE
     if flags & (MODEL | ATTENTION):
         return memory, table, np.empty(0, np.uint8), flags
-    raw, more = _act(arm, m, model, space, around, feedback, asked)
+    raw, more = _act(arm, m, model, space, around, feedback, wish)
     return memory, table, raw, flags | more

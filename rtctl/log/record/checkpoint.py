@@ -15,13 +15,12 @@ import numpy as np
 
 from rtctl.arm.escape import DIRECTIONS, Phase
 from rtctl.arm.flat import shapes_of
-from rtctl.arm.memory import HOT, Memory
+from rtctl.arm.memory import HOT, Memory, record_of
 from rtctl.arm.robot import Robot
 from rtctl.types import Severity, State, Status, Task
 from rtctl.world.primitives import MESH
 
 PERIOD = 5.0  # [s] of robot time between two
-_HOT = "hot"  # stands for the type of the memory's record
 
 
 class Checkpoint(NamedTuple):
@@ -61,7 +60,9 @@ def decode_checkpoint(data: bytes, robot: Robot, template: Memory) -> Checkpoint
         memory = Memory(**{name: _value(node, hints[name], raw) for name, node in values})
         memory = _with_meshes(memory, robot)
         _check(memory, template)
-        shapes = shapes_of(memory.placed.obstacles, memory.placed.moving)  # made anew: they are not checked singly
+        shapes = shapes_of(
+            memory.placed.obstacles, memory.placed.moving, memory.placed.creep, memory.placed.stale
+        )  # made anew: they are not checked singly
         return Checkpoint(memory._replace(shapes=shapes), tuple(int(c) & 0xFF for c in body["counters"]))
     except (msgspec.MsgspecError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise ValueError(f"not a checkpoint: {error}") from None
@@ -75,7 +76,7 @@ def layout() -> str:
 
 def _layouts() -> Iterator[tuple[str, tuple[str, ...]]]:
     yield "Memory", Memory.__struct_fields__
-    yield _HOT, tuple(f"{name} {HOT[name].base.str}{HOT[name].shape}" for name in HOT.names or ())
+    yield "hot", tuple(f"{name} {HOT[name].base.str}{HOT[name].shape}" for name in HOT.names or ())
     for name, kind in sorted(_kinds().items()):
         yield name, kind._fields
 
@@ -98,7 +99,7 @@ def _plain(value: Any, blobs: list[bytes]) -> Any:
     """Return a value as JSON knows it; arrays are appended to blobs."""
     if isinstance(value, np.ndarray):
         blobs.append(value.tobytes())
-        return {"a": _HOT if value.dtype == HOT else value.dtype.str, "s": value.shape}
+        return {"a": value.dtype.str, "s": value.shape}
     if isinstance(value, tuple):
         left_out = {"World": "known", "Obstacles": "mesh"}.get(type(value).__name__, "")
         nodes = [None if name == left_out else _plain(each, blobs) for name, each in _named(value)]
@@ -132,7 +133,7 @@ class _Raw:
 
 def _value(node: Any, hint: Any, raw: _Raw) -> Any:
     if isinstance(node, dict) and "a" in node:
-        return raw.take(HOT if node["a"] == _HOT else np.dtype(node["a"]), tuple(node["s"]))
+        return raw.take(np.dtype(node["a"]), tuple(node["s"]))
     if isinstance(node, dict) and "n" in node:
         kind = _kinds()[node["n"]]
         hints = get_type_hints(kind)
@@ -163,7 +164,7 @@ def _check(memory: Memory, template: Memory) -> None:
         raise ValueError("not a checkpoint of this robot: joints")
     if not isinstance(memory.held, tuple) or not all(isinstance(text, str) for text in memory.held):
         raise ValueError("not a checkpoint: held")
-    h = memory.hot[0]
+    h = record_of(memory.hot)[0]
     kinds = {
         "state": State, "reaction": Severity, "status": Status, "task": Task, "goal_task": Task, "hold_task": Task,
         "escape_phase": Phase,
