@@ -14,6 +14,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
 U64 = NDArray[np.uint64]
+U32 = NDArray[np.uint32]
 U8 = NDArray[np.uint8]
 B1 = NDArray[np.bool_]
 

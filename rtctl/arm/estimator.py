@@ -140,35 +140,55 @@ def joint_step(
     return JointEstimate(*fields), innovation
 
 
+class Covariance(NamedTuple):
+    """A covariance (2, 2) of (x, xd), in numbers: kernels make no array of it."""
+
+    xx: float
+    xv: float
+    vx: float
+    vv: float
+
+
 @kernel
-def _propagate(P: F64, dt: float, sigma: float) -> F64:
-    """Return F P F^T + Q for F = [1 dt; 0 1] and an acceleration of deviation sigma, constant over the step."""
-    q = sigma * sigma * dt * dt
-    p01 = P[0, 1] + dt * P[1, 1]
+def covariance(P: F64) -> Covariance:
+    """Return a covariance (2, 2) in numbers."""
+    return Covariance(P[0, 0], P[0, 1], P[1, 0], P[1, 1])
+
+
+@kernel
+def matrix(P: Covariance) -> F64:
+    """Return a covariance as an array (2, 2)."""
     out = np.empty((2, 2))
-    out[0, 0] = P[0, 0] + dt * (P[0, 1] + p01) + 0.25 * dt * dt * q
-    out[0, 1] = p01 + 0.5 * dt * q
-    out[1, 0] = out[0, 1]
-    out[1, 1] = P[1, 1] + q
+    out[0, 0], out[0, 1], out[1, 0], out[1, 1] = P.xx, P.xv, P.vx, P.vv
     return out
 
 
 @kernel
-def _correct(P: F64, h0: float, h1: float, r: float) -> tuple[float, float, float, F64]:
+def propagate(P: Covariance, dt: float, sigma: float) -> Covariance:
+    """Return F P F^T + Q for F = [1 dt; 0 1] and an acceleration of deviation sigma, constant over the step."""
+    q = sigma * sigma * dt * dt
+    p01 = P.xv + dt * P.vv
+    off = p01 + 0.5 * dt * q
+    return Covariance(P.xx + dt * (P.xv + p01) + 0.25 * dt * dt * q, off, off, P.vv + q)
+
+
+@kernel
+def correct(P: Covariance, h0: float, h1: float, r: float) -> tuple[float, float, float, Covariance]:
     """Return S, the gains and the covariance after a scalar measurement h0 x + h1 xd of deviation r (Joseph form)."""
-    g0 = P[0, 0] * h0 + P[0, 1] * h1
-    g1 = P[1, 0] * h0 + P[1, 1] * h1
+    g0 = P.xx * h0 + P.xv * h1
+    g1 = P.vx * h0 + P.vv * h1
     S = h0 * g0 + h1 * g1 + r * r
     k0, k1 = g0 / S, g1 / S
     m00, m01, m10, m11 = 1.0 - k0 * h0, -k0 * h1, -k1 * h0, 1.0 - k1 * h1  # I - K H
-    a00, a01 = m00 * P[0, 0] + m01 * P[1, 0], m00 * P[0, 1] + m01 * P[1, 1]
-    a10, a11 = m10 * P[0, 0] + m11 * P[1, 0], m10 * P[0, 1] + m11 * P[1, 1]
-    out = np.empty((2, 2))
-    out[0, 0] = a00 * m00 + a01 * m01 + k0 * k0 * r * r
-    out[0, 1] = a00 * m10 + a01 * m11 + k0 * k1 * r * r
-    out[1, 0] = out[0, 1]
-    out[1, 1] = a10 * m10 + a11 * m11 + k1 * k1 * r * r
-    return S, k0, k1, out
+    a00, a01 = m00 * P.xx + m01 * P.vx, m00 * P.xv + m01 * P.vv
+    a10, a11 = m10 * P.xx + m11 * P.vx, m10 * P.xv + m11 * P.vv
+    off = a00 * m10 + a01 * m11 + k0 * k1 * r * r
+    return (
+        S,
+        k0,
+        k1,
+        Covariance(a00 * m00 + a01 * m01 + k0 * k0 * r * r, off, off, a10 * m10 + a11 * m11 + k1 * k1 * r * r),
+    )
 
 
 @kernel
@@ -183,7 +203,8 @@ def _predict(
         turn[i] = dt * (omega[i] + 0.5 * dt * alpha[i])
         omega1[i] = omega[i] + dt * alpha[i]
     R1 = orthonormal(compose(exp3(turn), R))
-    return x1, xd1, _propagate(P, dt, sigma_a), R1, omega1, _propagate(P_rot, dt, sigma_alpha)
+    P1 = matrix(propagate(covariance(P), dt, sigma_a))
+    return x1, xd1, P1, R1, omega1, matrix(propagate(covariance(P_rot), dt, sigma_alpha))
 
 
 @kernel
@@ -191,8 +212,8 @@ def _update_velocity(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     xd_measured: F64, omega_measured: F64, r_v: float, r_omega: float,
 ) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
-    S, k0, k1, P1 = _correct(P, 0.0, 1.0, r_v)
-    S_rot, l0, l1, P_rot1 = _correct(P_rot, 0.0, 1.0, r_omega)
+    S, k0, k1, P1 = correct(covariance(P), 0.0, 1.0, r_v)
+    S_rot, l0, l1, P_rot1 = correct(covariance(P_rot), 0.0, 1.0, r_omega)
     x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     total = 0.0
     for i in range(3):
@@ -201,7 +222,7 @@ def _update_velocity(
         turn[i], omega1[i] = l0 * y_rot, omega[i] + l1 * y_rot
         total += y * y / S + y_rot * y_rot / S_rot
     R1 = orthonormal(compose(exp3(turn), R))
-    return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
+    return x1, xd1, matrix(P1), R1, omega1, matrix(P_rot1), math.sqrt(total / 6.0)
 
 
 @kernel
@@ -221,8 +242,8 @@ def _update_pose(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
     x_measured: F64, R_measured: F64, age: float, r_x: float, r_rot: float,
 ) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
-    S, k0, k1, P1 = _correct(P, 1.0, -age, r_x)
-    S_rot, l0, l1, P_rot1 = _correct(P_rot, 1.0, -age, r_rot)
+    S, k0, k1, P1 = correct(covariance(P), 1.0, -age, r_x)
+    S_rot, l0, l1, P_rot1 = correct(covariance(P_rot), 1.0, -age, r_rot)
     x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         turn[i] = -age * omega[i]
@@ -234,7 +255,7 @@ def _update_pose(
         turn[i], omega1[i] = l0 * y_rot[i], omega[i] + l1 * y_rot[i]
         total += y * y / S + y_rot[i] * y_rot[i] / S_rot
     R1 = orthonormal(compose(exp3(turn), R))
-    return x1, xd1, P1, R1, omega1, P_rot1, math.sqrt(total / 6.0)
+    return x1, xd1, matrix(P1), R1, omega1, matrix(P_rot1), math.sqrt(total / 6.0)
 
 
 @kernel
@@ -247,22 +268,20 @@ def filter_joints(
     for i in range(n):
         position = q[i] + dt * (qd[i] + 0.5 * dt * qdd[i])
         speed = qd[i] + dt * qdd[i]
-        C = _propagate(P[i], dt, sigma_qdd[i])
+        C = propagate(Covariance(P[i, 0, 0], P[i, 0, 1], P[i, 1, 0], P[i, 1, 1]), dt, sigma_qdd[i])
         if replies[i] > 0:
             t = age[i]
             y = q_measured[i] - (position - t * speed + 0.5 * t * t * qdd[i])
-            S, k0, k1, C = _correct(C, 1.0, -t, r_q[i])
+            S, k0, k1, C = correct(C, 1.0, -t, r_q[i])
             position, speed = position + k0 * y, speed + k1 * y
             innovation[i] = abs(y) / math.sqrt(S)
             if has_qd:
                 y = qd_measured[i] - (speed - t * qdd[i])
-                S, k0, k1, C = _correct(C, 0.0, 1.0, r_qd[i])
+                S, k0, k1, C = correct(C, 0.0, 1.0, r_qd[i])
                 position, speed = position + k0 * y, speed + k1 * y
                 innovation[i] = max(innovation[i], abs(y) / math.sqrt(S))
         q1[i], qd1[i] = position, speed
-        for r in range(2):
-            for c in range(2):
-                P1[i, r, c] = C[r, c]
+        P1[i, 0, 0], P1[i, 0, 1], P1[i, 1, 0], P1[i, 1, 1] = C.xx, C.xv, C.vx, C.vv
     return q1, qd1, P1, innovation
 
 

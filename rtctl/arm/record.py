@@ -10,7 +10,7 @@ import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, I32, U8, Feedback
+from rtctl.types import F64, I32, U32, Feedback
 
 
 @cache
@@ -74,6 +74,7 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
     )
 
 
+_WORD = 0xFFFFFFFF
 SCALARS = record_dtype(0, 0).itemsize  # bytes of what does not depend on joints and slots
 
 
@@ -90,8 +91,8 @@ class Outcome(NamedTuple):
 
 
 @kernel
-def _put(out: U8, at: int, raw: U8) -> int:
-    """Write bytes to out from `at` on; return where they end."""
+def _put(out: U32, at: int, raw: U32) -> int:
+    """Write words to out from `at` on; return where they end."""
     for i in range(raw.shape[0]):
         out[at + i] = raw[i]
     end: int = at + raw.shape[0]
@@ -99,66 +100,75 @@ def _put(out: U8, at: int, raw: U8) -> int:
 
 
 @kernel
-def _put_reals(out: U8, at: int, values: F64) -> int:
-    return _put(out, at, values.view(np.uint8))
+def _put_reals(out: U32, at: int, values: F64) -> int:
+    return _put(out, at, values.view(np.uint32))
+
+
+@kernel
+def _put_record(out: U32, at: int, values: F64, longs: F64) -> int:
+    """Write an array of a record, through a work array `longs` at least as long: a record's own may lie anywhere."""
+    for i in range(values.shape[0]):
+        longs[i] = values[i]
+    return _put(out, at, longs[: values.shape[0]].view(np.uint32))
 
 
 @kernel
 def pack(
     m: Any, f: Feedback, o: Outcome, errors: tuple[float, float, float], F: F64, torques: F64, seen: F64, nearest: I32,
     dt: float,
-) -> U8:  # fmt: skip
-    """Return the bytes of the record of one tick.
+) -> U32:  # fmt: skip
+    """Return the record of one tick in words of four bytes, of which every field is a whole number.
 
     m: the memory after it. errors: error [m], error_rot [rad], sigma_min [1/kg]. seen: (4 slots,) rho [m], then force
     (slots, 3) [N]. torques: (5, n) [Nm] from tau_motion to tau_gravity.
     """
     n, slots = f.q.shape[0], nearest.shape[0]
-    out = np.empty(SCALARS + 96 * n + 36 * slots, np.uint8)
-    reals, words, longs = np.empty(3), np.empty(4, np.uint32), np.empty(2, np.uint64)
-    longs[0], longs[1] = m.tick, f.slot
-    at = _put(out, 0, longs.view(np.uint8))
+    out = np.empty((SCALARS + 96 * n + 36 * slots) // 4, np.uint32)
+    reals, longs = np.empty(max(n, 4)), np.empty(1, np.uint64)
+    long, real = longs.view(np.uint32), reals[:1].view(np.uint32)
+    longs[0] = m.tick
+    at = _put(out, 0, long)
+    longs[0] = f.slot
+    at = _put(out, at, long)
     reals[0] = f.slot * dt
-    at = _put(out, at, reals[:1].view(np.uint8))
-    words[0], words[1] = f.missed, f.link
-    at = _put(out, at, words[:2].view(np.uint8))
+    at = _put(out, at, real)
+    out[at], out[at + 1] = f.missed, f.link
+    at += 2
     for values in (f.q, f.qd, f.tau, f.age):
         at = _put_reals(out, at, values)
-    at = _put(out, at, f.replies.astype(np.uint32).view(np.uint8))
-    at = _put(out, at, f.drive.astype(np.int32).view(np.uint8))
-    words[0] = o.verb
-    at = _put(out, at, words[:1].view(np.uint8))
-    reals[0], reals[1] = f.lateness, f.compute
-    at = _put(out, at, reals[:2].view(np.uint8))
-    at = _put_reals(out, at, m.x.copy())
-    at = _put_reals(out, at, m.xd.copy())
+    for i in range(n):
+        out[at + i], out[at + n + i] = f.replies[i], f.drive[i] & _WORD
+    at += 2 * n
+    out[at] = o.verb
+    reals[0] = f.lateness
+    at = _put(out, at + 1, real)
+    reals[0] = f.compute
+    at = _put(out, at, real)
+    at = _put_record(out, at, m.x, reals)
+    at = _put_record(out, at, m.xd, reals)
     at = _put_reals(out, at, quat_of(m.R))
-    at = _put_reals(out, at, m.omega.copy())
+    at = _put_record(out, at, m.omega, reals)
     reals[0] = m.innovation
-    at = _put(out, at, reals[:1].view(np.uint8))
+    at = _put(out, at, real)
     for values in (o.goal, o.goal_wxyz, o.goal_axis):
         at = _put_reals(out, at, values)
-    words[0] = o.task
-    at = _put(out, at, words[:1].view(np.uint8))
-    at = _put_reals(out, at, F)
-    reals[0], reals[1], reals[2] = errors
-    at = _put_reals(out, at, reals)
+    out[at] = o.task
+    at = _put_reals(out, at + 1, F)
+    for value in errors:
+        reals[0] = value
+        at = _put(out, at, real)
     at = _put_reals(out, at, seen)
-    at = _put(out, at, nearest.view(np.uint8))
+    at = _put(out, at, nearest.view(np.uint32))
     for r in range(torques.shape[0]):
         at = _put_reals(out, at, torques[r])
     at = _put_reals(out, at, o.tau_wanted)
-    at = _put_reals(out, at, m.sent[0, :n].copy())
-    words[0], words[1], words[2], words[3] = o.command, m.cut, m.state, m.status
-    at = _put(out, at, words.view(np.uint8))
-    words[0] = np.uint32(m.blocker & 0xFFFFFFFF)
-    at = _put(out, at, words[:1].view(np.uint8))
+    at = _put_record(out, at, m.sent[0, :n], reals)
+    out[at], out[at + 1], out[at + 2], out[at + 3] = o.command, m.cut, m.state, m.status
+    out[at + 4] = m.blocker & _WORD
     longs[0] = m.holders
-    at = _put(out, at, longs[:1].view(np.uint8))
-    words[0], words[1] = m.escape_phase, m.reaction
-    at = _put(out, at, words[:2].view(np.uint8))
+    at = _put(out, at + 5, long)
+    out[at], out[at + 1] = m.escape_phase, m.reaction
     longs[0] = m.in_force
-    at = _put(out, at, longs[:1].view(np.uint8))
-    words[0] = m.evaluated
-    _put(out, at, words[:1].view(np.uint8))
+    at = _put(out, at + 2, long)
+    out[at] = m.evaluated
     return out

@@ -26,7 +26,7 @@ from rtctl.arm.target import progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
-from rtctl.types import F64, U8, Drive, Feedback, Severity, State, Task
+from rtctl.types import F64, U32, Drive, Feedback, Severity, State, Task
 from rtctl.world.obstacle_table import distances_from, margins
 from rtctl.world.primitives import advanced_pose
 
@@ -164,8 +164,8 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
 @kernel
 def _act(
     arm: Arm, m: Any, model: Model, space: OperationalSpace, around: Surroundings, f: Feedback, asked: Asked
-) -> tuple[U8, int]:
-    """Run the second half of a tick; return the bytes of its record, and what `progress_timers` asks for."""
+) -> tuple[U32, int]:
+    """Run the second half of a tick; return its record in words, and what `progress_timers` asks for."""
     c, n = arm.constants[0], f.q.shape[0]
     e, e_rot, q_rest = wanted(c, m, model, asked.bits & CHOSEN != 0)
     q, qd, x, R, xd, omega = m.q[:n].copy(), m.qd[:n].copy(), m.x.copy(), m.R.copy(), m.xd.copy(), m.omega.copy()
@@ -199,11 +199,11 @@ def _act(
 def servo(
     arm: Arm, before: F64, parameters: F64, table_before: F64, shapes: F64, bodies: BODIES, feedback: Feedback,
     asked: int,
-) -> tuple[F64, F64, U8, int]:  # fmt: skip
+) -> tuple[F64, F64, U32, int]:  # fmt: skip
     """Run the servo level of one tick from a stage on, or until Python is needed.
 
     before: the memory, see `memory.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.
-    Returns the memory, the table, the bytes of the tick's record, and flags: DONE | WORDS when it is over; MODEL:
+    Returns the memory, the table, the words of the tick's record, and flags: DONE | WORDS when it is over; MODEL:
     evaluate the model at the joints of the memory where its `evaluated` says so, and the task space, then go on at
     MEASURED; ATTENTION: supervise, then go on at DECIDED; DIAGNOSE: the tick is over but for what holds the arm. MOVED:
     the obstacles are elsewhere than they were.
@@ -217,6 +217,6 @@ def servo(
     )
     flags = _sense(arm.constants[0], m, feedback, model, around, wish) if wish.stage != DECIDED else DONE
     if flags & (MODEL | ATTENTION):
-        return memory, table, np.empty(0, np.uint8), flags
+        return memory, table, np.empty(0, np.uint32), flags
     raw, more = _act(arm, m, model, space, around, feedback, wish)
     return memory, table, raw, flags | more

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rtctl.arm.estimator import Design, EstimatorParams, JointParams, _correct, _propagate
+from rtctl.arm.estimator import Covariance, Design, EstimatorParams, JointParams, correct, matrix, propagate
 from rtctl.kernel import kernel
 from rtctl.types import F64
 
@@ -55,23 +55,27 @@ def _steady(
 
 
 @kernel
+def _repeats(before: float, now: float) -> bool:
+    return abs(now - before) <= UNCHANGED * abs(before)
+
+
+@kernel
 def _repeat(
     sigma: float, r_v: float, r_x: float, dt: float, ratio: int, age: float, has_velocity: bool
 ) -> tuple[F64, F64, F64]:
     """Return covariance (2, 2) and gains (2,), (2,) after cycles of `ratio` steps that change it no more."""
-    P = np.zeros((2, 2))
-    P[0, 0], P[1, 1] = r_x * r_x, r_v * r_v
+    P = Covariance(r_x * r_x, 0.0, 0.0, r_v * r_v)
     gain_velocity, gain_pose = np.zeros(2), np.zeros(2)
     for _ in range(CYCLES):
         before = P
         for _ in range(ratio):
-            P = _propagate(P, dt, sigma)
+            P = propagate(P, dt, sigma)
             if has_velocity:
-                _, gain_velocity[0], gain_velocity[1], P = _correct(P, 0.0, 1.0, r_v)
-        _, gain_pose[0], gain_pose[1], P = _correct(P, 1.0, -age, r_x)
-        if np.all(np.abs(P - before) <= UNCHANGED * np.abs(before)):
+                _, gain_velocity[0], gain_velocity[1], P = correct(P, 0.0, 1.0, r_v)
+        _, gain_pose[0], gain_pose[1], P = correct(P, 1.0, -age, r_x)
+        if _repeats(before.xx, P.xx) and _repeats(before.xv, P.xv) and _repeats(before.vv, P.vv):
             break
-    return P, gain_velocity, gain_pose
+    return matrix(P), gain_velocity, gain_pose
 
 
 def _round(values: F64) -> F64:
