@@ -250,7 +250,7 @@ class Standing:
         self.enabled = state != State.IDLE
         first = at_rest(self.robot, q)
         gravity = first.model.g  # already held: nothing has to build up
-        self.memory: Memory = first._replace(state=state, sent=np.tile(gravity, (4, 1)), pace=1.0)
+        self.memory: Memory = first._replace(state=state, sent=np.tile(gravity, (4, 1)), speed_scale=1.0)
         self.command = Command(Drive.TORQUE, gravity)
         self.record: Record
 

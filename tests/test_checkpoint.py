@@ -53,8 +53,8 @@ def busy() -> Memory:
     aim = Goal(np.array([0.4, 0.1, 0.5]), np.array([1.0, 0.0, 0.0, 0.0]), Task.POSE, 1e-3, 1e-2, posture=PANDA_HOME)
     return arm.memory._replace(
         goal=aim,
-        held=("ball at panda_link5",),
-        holders=1 << 63,
+        blocked_by=("ball at panda_link5",),
+        blockers=1 << 63,
         escape=Escape(Phase.FIRST, hit=np.inf),
         innovation=np.nan,
     )

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rtctl.arm.diagnosis import Balance, at_edge, held
+from rtctl.arm.diagnosis import Balance, at_edge, blockers
 from rtctl.arm.escape import Phase
 from rtctl.arm.self_collision import Hull
 from rtctl.design.pairs import hulls_of
@@ -47,7 +47,7 @@ def some(count: int, **values: float) -> F64:
     ],
 )
 def test_the_cause_that_hides_the_others_comes_first_and_all_that_hold_are_named(change, status, mask, main):
-    assert held(NOTHING._replace(**change)) == (status, mask, main)
+    assert blockers(NOTHING._replace(**change)) == (status, mask, main)
 
 
 def _second(f, q: F64, u: F64, a: F64, b: F64) -> float:

@@ -50,10 +50,10 @@ def test_a_drive_that_says_it_gives_less_is_believed():
     arm.ticks(5)
     half = {"tau": arm.command.tau * np.where(np.arange(7) == JOINT, 0.5, 1.0), "link": int(WARNED)}
     arm.ticks(4, **half)
-    assert arm.memory.pulled
-    assert arm.memory.counters.pulled == 0
+    assert arm.memory.slew_follows_echo
+    assert arm.memory.counters.slew_follows_echo == 0
     arm.ticks(4, **{**half, "link": 0})
-    assert arm.memory.counters.pulled >= 3
+    assert arm.memory.counters.slew_follows_echo >= 3
 
 
 # ---- encoder

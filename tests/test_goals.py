@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.arm.progress import Progress, arrived, at_rest, idle, time_left
+from rtctl.arm.progress import Progress, arrived, at_rest, stall_timer, time_left
 from rtctl.control.goals import refusal
 from rtctl.types import Goal, Task
 
@@ -84,7 +84,7 @@ def test_who_comes_nearer_more_slowly_than_an_eighth_of_full_speed_is_idle_the_s
     dt, waited, nearest, left = 0.01, 0.0, 10.0, 10.0
     for k in range(1, 1000):
         left -= pace * dt
-        waited, nearest = idle(waited, STUCK, left, nearest, dt, 2.0), min(nearest, left)
+        waited, nearest = stall_timer(waited, STUCK, left, nearest, dt, 2.0), min(nearest, left)
         if waited >= 2.0 - 1e-9:
             assert k * dt == pytest.approx(until, abs=2 * dt)
             return
@@ -92,20 +92,20 @@ def test_who_comes_nearer_more_slowly_than_an_eighth_of_full_speed_is_idle_the_s
 
 
 def test_who_moves_fast_is_less_and_less_idle():
-    assert idle(1.0, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == pytest.approx(0.98)
-    assert idle(0.01, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == 0.0
+    assert stall_timer(1.0, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == pytest.approx(0.98)
+    assert stall_timer(0.01, STUCK._replace(speed=0.05), 1.0, 1.0, 0.01, 2.0) == 0.0
 
 
 def test_who_turns_on_the_spot_is_idle_unless_it_turns_to_its_goal():
-    assert idle(1.0, STUCK._replace(rate=0.6), 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
-    assert idle(1.0, STUCK._replace(rate=0.6), 0.99, 1.0, 0.01, 2.0) < 0.95
-    assert idle(1.0, STUCK, 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
+    assert stall_timer(1.0, STUCK._replace(rate=0.6), 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
+    assert stall_timer(1.0, STUCK._replace(rate=0.6), 0.99, 1.0, 0.01, 2.0) < 0.95
+    assert stall_timer(1.0, STUCK, 1.0, 1.0, 0.01, 2.0) == pytest.approx(1.01)
 
 
 def test_near_the_goal_half_of_what_is_left_is_enough():
-    assert idle(1.0, STUCK, 0.0199, 0.02, 0.02, 2.0) == pytest.approx(1.0)
-    assert idle(1.0, STUCK, 0.1999, 0.2, 0.02, 2.0) == pytest.approx(1.018)
+    assert stall_timer(1.0, STUCK, 0.0199, 0.02, 0.02, 2.0) == pytest.approx(1.0)
+    assert stall_timer(1.0, STUCK, 0.1999, 0.2, 0.02, 2.0) == pytest.approx(1.018)
 
 
 def test_who_turned_back_gains_nothing_until_it_is_nearer_than_ever():
-    assert idle(1.0, STUCK, 0.9, 0.5, 0.01, 2.0) == pytest.approx(1.01)
+    assert stall_timer(1.0, STUCK, 0.9, 0.5, 0.01, 2.0) == pytest.approx(1.01)

@@ -82,11 +82,11 @@ def test_the_parameters_hold_the_model_and_its_task_space(task: Task) -> None:
 def test_a_field_of_the_memory_is_replaced_in_a_copy() -> None:
     memory = at_rest(robot(), PANDA_HOME)
     aim = goal(memory, [0.4, 0.1, 0.5])._replace(posture=PANDA_HOME)
-    other = memory._replace(goal=aim, holders=1 << 63, still=3)
+    other = memory._replace(goal=aim, blockers=1 << 63, still=3)
     assert memory.goal is None
     assert other.goal is not None
     assert same(tuple(other.goal), tuple(aim))
-    assert (other.holders, other.still, memory.still) == (1 << 63, 3, 0)
+    assert (other.blockers, other.still, memory.still) == (1 << 63, 3, 0)
     assert other._replace(goal=None).goal is None
     assert record_of(other.hot)["tick"].item() == memory.tick
     with pytest.raises(AttributeError):

@@ -120,7 +120,7 @@ def test_joints_are_given_their_speed_gradually():
     paces = []
     for _ in range(900):
         arm.tick()
-        paces.append(arm.memory.pace)
+        paces.append(arm.memory.speed_scale)
     assert paces[100] <= 0.11
     assert paces[-1] == 1.0
     assert np.diff(paces).min() >= 0.0
@@ -208,7 +208,7 @@ def test_beyond_a_limit_arming_is_refused_and_recovering_is_not():
     model = arm.memory.model
     qdd = model.A_inv @ (arm.memory.sent[0] - model.g)
     assert qdd[3] > 0.0  # inward
-    assert arm.memory.pace == pytest.approx(0.1)
+    assert arm.memory.speed_scale == pytest.approx(0.1)
 
 
 # ---- out

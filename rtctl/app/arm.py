@@ -82,8 +82,8 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
     if after.state != before.state:
         found.append(("state", after.state.name))
-    if (after.status, after.holders) != (before.status, before.holders) and after.status != Status.NO_GOAL:
-        found.append((after.status.name.lower(), "; ".join(after.held)))
+    if (after.status, after.blockers) != (before.status, before.blockers) and after.status != Status.NO_GOAL:
+        found.append((after.status.name.lower(), "; ".join(after.blocked_by)))
     return found
 
 
@@ -99,7 +99,7 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
     """Return what `rtctl status` shows of an arm."""
     goal, (error, error_rot) = m.goal, errors(m)
     return {
-        "detail": "; ".join(m.held),
+        "detail": "; ".join(m.blocked_by),
         "q_rad": m.joints.q,
         "x_m": m.tip.x,
         "wxyz": quat_of(m.tip.R),

@@ -132,7 +132,7 @@ class ArmFeed:
         return self._next(self.follower, m, truth) or goal
 
     def _next(self, follower: Follower, m: Memory, truth: Truth) -> Goal | None:
-        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.held), m.tip.x, m.joints.q))
+        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.blocked_by), m.tip.x, m.joints.q))
         self.events += [(truth.time, "planned", text) for text in follower.news]
         follower.news.clear()
         if follower.over:

@@ -38,7 +38,7 @@ class Balance(NamedTuple):
     edge: bool  # the tip is as far in the goal's direction as the links are long
 
 
-class Held(NamedTuple):
+class Blockers(NamedTuple):
     """What holds the arm."""
 
     status: Status
@@ -46,7 +46,7 @@ class Held(NamedTuple):
     main: int  # the strongest of them, -1 for none
 
 
-def held(b: Balance) -> Held:
+def blockers(b: Balance) -> Blockers:
     """Return what holds an arm with this balance.
 
     The causes are tried from the one that hides the others: torque that ran out; then whatever opposes the drive,
@@ -54,18 +54,18 @@ def held(b: Balance) -> Held:
     """
     full = np.flatnonzero(b.full >= AT_BOUND)
     if len(full):
-        return Held(Status.SATURATED, _mask(full), int(b.full.argmax()))
+        return Blockers(Status.SATURATED, _mask(full), int(b.full.argmax()))
     walls, joints = np.flatnonzero(b.obstacles >= HOLDS), np.flatnonzero(b.limits >= HOLDS)
     lost = b.granted < LOST
     if len(joints) and b.limits.sum() >= b.obstacles.sum() and (not lost or b.limits.sum() > 0.5):
-        return Held(Status.LIMITED, _mask(joints), int(b.limits.argmax()))
+        return Blockers(Status.LIMITED, _mask(joints), int(b.limits.argmax()))
     if len(walls) and not lost:
         shadowed = bool((b.goal_rho[walls] < b.rho0).all())
         status = Status.SHADOWED if shadowed else Status.LOCAL_MINIMUM
-        return Held(status, _mask(walls), int(b.obstacles.argmax()))
+        return Blockers(status, _mask(walls), int(b.obstacles.argmax()))
     if lost:
-        return Held(Status.UNREACHABLE if b.edge else Status.SINGULAR, 0, -1)
-    return Held(Status.LOCAL_MINIMUM, 0, -1)
+        return Blockers(Status.UNREACHABLE if b.edge else Status.SINGULAR, 0, -1)
+    return Blockers(Status.LOCAL_MINIMUM, 0, -1)
 
 
 def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balance:
@@ -156,7 +156,7 @@ def at_edge(J: F64, e: F64) -> bool:
     return bool(largest <= EDGE)
 
 
-def names(robot: Robot, m: Memory, found: Held) -> tuple[str, ...]:
+def names(robot: Robot, m: Memory, found: Blockers) -> tuple[str, ...]:
     """Return what holds the arm in words, the strongest first."""
     bits = [i for i in range(64) if found.mask >> i & 1]
     order = sorted(bits, key=lambda i: i != found.main)

@@ -74,15 +74,6 @@ def start(x: F64, R: F64, design: Design) -> TipEstimate:
     return TipEstimate(x.copy(), np.zeros(3), design.P.copy(), R.copy(), np.zeros(3), design.P_rot.copy())
 
 
-def held(est: TipEstimate, x: F64, R: F64, J: F64, qd: F64) -> TipEstimate:
-    """Return the tip as one evaluation knows it, unfiltered: what a servo without estimator holds until the next.
-
-    x (3,) [m], R (3, 3), J (6, n) of the evaluation; qd (n,) [rad/s].
-    """
-    twist = matvec(J, qd)
-    return est._replace(x=x.copy(), xd=twist[:3].copy(), R=R.copy(), omega=twist[3:].copy())
-
-
 def predict(est: TipEstimate, a: F64, alpha: F64, dt: float, params: EstimatorParams) -> TipEstimate:
     """Return the estimate dt later: x += xd dt + a dt^2/2, xd += a dt, R <- exp(omega dt + alpha dt^2/2) R.
 
@@ -107,18 +98,6 @@ def update_pose(est: TipEstimate, x: F64, R: F64, age: float, params: EstimatorP
     The measurement is of x - age xd, so that its age is neither a bias nor false certainty. x: (3,) [m]. R: (3, 3).
     """
     *fields, innovation = _update_pose(*est, x, R, age, params.r_x, params.r_rot)
-    return TipEstimate(*fields), innovation
-
-
-def tip_step(
-    est: TipEstimate, J: F64, Jdqd: F64, qdd: F64, J_now: F64, qd: F64, dt: float, params: EstimatorParams
-) -> tuple[TipEstimate, float]:
-    """Return `predict` by the acceleration J qdd + Jdqd, then `update_velocity` with J_now qd, and its innovation.
-
-    J, Jdqd (6, n), (6,): of the step's start, qdd (n,) [rad/s2] during it. J_now (6, n), qd (n,) [rad/s]: of its end.
-    """
-    p = params
-    *fields, innovation = _tip_step(*est, J, Jdqd, qdd, J_now, qd, dt, p.sigma_a, p.sigma_alpha, p.r_v, p.r_omega)
     return TipEstimate(*fields), innovation
 
 
@@ -223,18 +202,6 @@ def _update_velocity(
         total += y * y / S + y_rot * y_rot / S_rot
     R1 = orthonormal(compose(exp3(turn), R))
     return x1, xd1, matrix(P1), R1, omega1, matrix(P_rot1), math.sqrt(total / 6.0)
-
-
-@kernel
-def _tip_step(
-    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
-    J: F64, Jdqd: F64, qdd: F64, J_now: F64, qd: F64, dt: float,
-    sigma_a: float, sigma_alpha: float, r_v: float, r_omega: float,
-) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
-    a = matvec(J, qdd) + Jdqd
-    x1, xd1, P1, R1, omega1, P_rot1 = _predict(x, xd, P, R, omega, P_rot, a[:3], a[3:], dt, sigma_a, sigma_alpha)
-    twist = matvec(J_now, qd)
-    return _update_velocity(x1, xd1, P1, R1, omega1, P_rot1, twist[:3], twist[3:], r_v, r_omega)
 
 
 @kernel

@@ -142,7 +142,7 @@ class Evidence(NamedTuple):
     active: bool  # drives are meant to be enabled
     powered: bool  # torque flows, or is being switched on
     jumped: bool  # a joint's position was implausible: further than it can have moved
-    pulled: bool  # the slew follows the echo, not what was sent
+    slew_follows_echo: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
     has_goal: bool
@@ -156,7 +156,7 @@ class Counters(NamedTuple):
     send_failed: int = 0
     disabled: int = 0
     mismatch: int = 0
-    pulled: int = 0
+    slew_follows_echo: int = 0
     jumps: int = 0  # last JUMP_WINDOW cycles, one bit each
     missed: int = 0
     innovation: int = 0
@@ -204,7 +204,7 @@ def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Count
         _grown(c.send_failed, link & _SEND_FAILED != 0),
         _grown(c.disabled, active and seen & _DISABLED != 0),
         _grown(c.mismatch, active and seen & _TORQUE != 0),
-        _grown(c.pulled, active and e.pulled and link & _DERATED == 0),
+        _grown(c.slew_follows_echo, active and e.slew_follows_echo and link & _DERATED == 0),
         ((c.jumps << 1) | (1 if e.jumped else 0)) & _JUMPS if active else 0,
         _grown(c.missed, e.missed != 0),
         _grown(c.innovation, active and not e.innovation <= innovation_max),
@@ -229,7 +229,7 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
         bits |= _B.drive_fault
     if n.disabled >= 5:
         bits |= _B.drive_disabled
-    if n.mismatch >= 5 or n.pulled >= 5:
+    if n.mismatch >= 5 or n.slew_follows_echo >= 5:
         bits |= _B.torque_mismatch
     if seen & detection.STUCK:
         bits |= _B.encoder_stuck

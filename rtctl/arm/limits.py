@@ -38,9 +38,8 @@ def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt
     """Return the torque (n,) [Nm] from which this tick may move by tau_rate dt.
 
     The echo is `lag` periods old and rounded to tau_lsb [Nm], so what was sent since may differ from it by
-    lag * tau_rate * dt + tau_lsb and no more. While
-    the drive follows, this is the torque last sent; when it does not (clamped, just enabled, a frame lost) it is
-    pulled to what the drive really applies.
+    lag * tau_rate * dt + tau_lsb and no more. While the drive follows, this is the torque last sent; when it does not
+    (clamped, just enabled, a frame lost) it is pulled to what the drive really applies.
     """
     out = np.empty_like(tau_sent)
     for i in range(tau_sent.shape[0]):
@@ -50,7 +49,7 @@ def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt
 
 
 @kernel
-def pulled(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
+def slew_follows_echo(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
     """Return whether `slew_reference` left what was sent by more than the rounding of an echo [Nm] on any joint."""
     for i in range(reference.shape[0]):
         if abs(reference[i] - tau_sent[i]) > tau_lsb[i]:
@@ -142,4 +141,4 @@ def command_torque(
     rows[2:5] = sent[:3]
     if moving:
         rows[5] = acceleration(A_inv, rows[1], h, g, viscous, qd)
-    return rows, cut, scale, pulled(reference, sent[0], tau_lsb)
+    return rows, cut, scale, slew_follows_echo(reference, sent[0], tau_lsb)

@@ -83,7 +83,7 @@ HOT = np.dtype(
             ("w_ref", _REAL, (3,)),  # [rad/s]
             ("status", _INT),  # types.Status
             ("blocker", _INT),  # obstacle slot or joint index that holds the arm most, -1 for none
-            ("holders", "<u8"),  # bits of all that hold it
+            ("blockers", "<u8"),  # bits of all that hold it
             ("escape_phase", _INT),  # as escape.Escape
             ("escape_hit", _REAL),
             ("escape_n", _REAL, (3,)),
@@ -93,20 +93,20 @@ HOT = np.dtype(
             ("escape_slow", _INT),
             ("still", _INT),  # ticks the tip has been at rest
             ("nearest", _REAL),  # [s] at full speed: the least that the goal was away
-            ("idle", _REAL),  # [s] for which it has not come nearer; see `progress.idle`
+            ("stall_timer", _REAL),  # [s] for which it has not come nearer; see `progress.stall_timer`
             # torque
             ("tau_obstacles", _REAL, _JOINT),  # [Nm] of the last tick
             ("sent", _REAL, (4, JOINTS_MAX)),  # [Nm] the last commands, newest first
             ("cut", _INT),  # types.Cut of the last tick
-            ("pulled", _INT),  # the slew starts from the echo: the drive does not give what it is sent
-            ("pace", _REAL),  # fraction of qd_max that joints may have
+            ("slew_follows_echo", _INT),  # the slew starts from the echo: the drive does not give what it is sent
+            ("speed_scale", _REAL),  # fraction of qd_max that joints may have
         ],
     )
 )
 _NAMES = frozenset(HOT.names or ())
-_COLD = ("hot", "n", "verdict", "held", "model", "parameters", "placed", "table", "shapes")
+_COLD = ("hot", "n", "verdict", "blocked_by", "model", "parameters", "placed", "table", "shapes")
 _JOINTS = ("qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
-_FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "pulled")
+_FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "slew_follows_echo")
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 
 
@@ -116,7 +116,7 @@ class Memory(msgspec.Struct, frozen=True):
     hot: F64  # what the servo level knows; see `record_of`
     n: int  # joints
     verdict: str  # why this tick's request was refused, '' when it was not
-    held: tuple[str, ...]  # what holds the arm in words
+    blocked_by: tuple[str, ...]  # what holds the arm, in words
     model: Model
     parameters: F64  # the model and the task space; see `flat`
     placed: World  # the obstacles when they were last edited

@@ -31,7 +31,7 @@ from rtctl.arm.servo_level import (
     servo,
 )
 from rtctl.arm.session import hold_at, supervised, with_goal
-from rtctl.arm.target import DIAGNOSE, START_PACE, WORDS, pursues
+from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, pursues
 from rtctl.arm.task import between, point_of
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.types import (
@@ -64,7 +64,7 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     """
     f = feedback if type(feedback.link) is int else feedback._replace(link=int(feedback.link))
     bits, verb, m = REQUEST if request.verb or request.goal is not None else 0, int(request.verb), memory
-    held, verdict = memory.held, ""
+    blocked_by, verdict = memory.blocked_by, ""
     if request.obstacles:
         m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
         verdict = m.verdict
@@ -76,15 +76,15 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
         bits |= WORLD if flags & MOVED else 0
         hot, table, raw, flags = servo(arm, hot, parameters, table, shapes, bodies, f, asking(MEASURED, bits, verb))
     if flags & ATTENTION:
-        m = Memory(hot, robot.n, verdict, held, model, parameters, placed, table, shapes)
+        m = Memory(hot, robot.n, verdict, blocked_by, model, parameters, placed, table, shapes)
         m, chosen = _decided(robot, m, feedback, request)
-        hot, table, held, verdict = m.hot, m.table, m.held, m.verdict
+        hot, table, blocked_by, verdict = m.hot, m.table, m.blocked_by, m.verdict
         hot, table, raw, flags = servo(
             arm, hot, parameters, table, shapes, bodies, f, asking(DECIDED, bits | chosen, verb)
         )
     if not robot.carry:
         model = model._replace(q=record_of(hot)["q"][0, : robot.n])  # the points have not moved either
-    m = Memory(hot, robot.n, verdict, () if flags & WORDS else held, model, parameters, placed, table, shapes)
+    m = Memory(hot, robot.n, verdict, () if flags & WORDS else blocked_by, model, parameters, placed, table, shapes)
     record = np.frombuffer(raw, record_dtype(robot.n, robot.slots))
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
@@ -109,7 +109,7 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         joints=joint_start(q, robot.joint_P), tip=start(model.x, model.R, robot.tip_design),
         task=robot.axes, axis=TOOL_Z, evaluated=True, q_previous=q,
         hold=hold_at(model.x, model.R, robot.axes), escape=Escape(), q_rest=q, blocker=-1,
-        nearest=np.inf, pace=START_PACE,
+        nearest=np.inf, speed_scale=START_SPEED_SCALE,
     )  # fmt: skip
 
 
@@ -154,7 +154,7 @@ def _diagnosed(robot: Robot, m: Memory, before: Memory, record: Record) -> Memor
     """Level of competence: what holds an arm that rests or creeps; written into the record, too."""
     m = _blocked(robot, m, before, record)
     h = record_of(m.hot)[0]
-    record["status"], record["blocker"], record["holders"] = h["status"], h["blocker"], h["holders"]
+    record["status"], record["blocker"], record["holders"] = h["status"], h["blocker"], h["blockers"]
     record["escape"] = h["escape_phase"]
     return m
 
@@ -178,9 +178,9 @@ def _blocked(robot: Robot, m: Memory, before: Memory, record: Record) -> Memory:
         begun = _caught(robot, m, record, goal, error)
         if begun.status == Status.ESCAPING:
             return begun
-    found = diagnosis.held(_balance(robot, m, record))
-    told = _with_held(robot, m, found)._replace(status=found.status)
-    if still < stall and told.held == (diagnosis.UNKNOWN,):
+    found = diagnosis.blockers(_balance(robot, m, record))
+    told = _with_blockers(robot, m, found)._replace(status=found.status)
+    if still < stall and told.blocked_by == (diagnosis.UNKNOWN,):
         return m if waited else _with_status(m, Status.MOVING)  # slow, and nothing new is in its way
     return told
 
@@ -191,27 +191,27 @@ def _balance(robot: Robot, m: Memory, record: Record) -> diagnosis.Balance:
 
 def _waited(robot: Robot, m: Memory) -> bool:
     """Return whether the arm has been at rest, or got no nearer to its goal, for long enough to ask what holds it."""
-    return bool(max(m.still * robot.dt, m.idle) >= robot.stop.stall - 0.5 * robot.dt)
+    return bool(max(m.still * robot.dt, m.stall_timer) >= robot.stop.stall - 0.5 * robot.dt)
 
 
 def _with_status(m: Memory, status: Status) -> Memory:
-    return m if m.status == status else m._replace(status=status, blocker=-1, holders=0, held=())
+    return m if m.status == status else m._replace(status=status, blocker=-1, blockers=0, blocked_by=())
 
 
-def _with_held(robot: Robot, m: Memory, found: diagnosis.Held) -> Memory:
-    return m._replace(blocker=found.main, holders=found.mask, held=diagnosis.names(robot, m, found))
+def _with_blockers(robot: Robot, m: Memory, found: diagnosis.Blockers) -> Memory:
+    return m._replace(blocker=found.main, blockers=found.mask, blocked_by=diagnosis.names(robot, m, found))
 
 
 def _caught(robot: Robot, m: Memory, record: Record, goal: Goal, error: float) -> Memory:
     """Return the memory of an arm that has just come to rest: where obstacles hold it, with an escape begun."""
-    found = diagnosis.held(_balance(robot, m, record))
+    found = diagnosis.blockers(_balance(robot, m, record))
     near = {Status.LOCAL_MINIMUM: robot.avoid.rho0, Status.SHADOWED: 2.0 * robot.avoid.rho0}
     if not found.mask or error < near.get(found.status, np.inf):
         return _with_status(m, Status.MOVING)
     begun = escape.begun(m.escape, error, escape.push_of(m.model, m.tau_obstacles, goal))
     if begun.phase == escape.Phase.GIVEN_UP:
         return _with_status(m, Status.MOVING)._replace(escape=begun)
-    return _with_held(robot, m, found)._replace(escape=begun, status=Status.ESCAPING)
+    return _with_blockers(robot, m, found)._replace(escape=begun, status=Status.ESCAPING)
 
 
 def _meshes_at(robot: Robot, position: np.ndarray, wxyz: np.ndarray) -> list[Shape]:

@@ -59,14 +59,14 @@ def time_left(p: Progress, v_max: float, w_max: float) -> float:
 
 
 @kernel
-def idle(before: float, p: Progress, left: float, nearest: float, dt: float, window: float) -> float:
+def stall_timer(before: float, p: Progress, left: float, nearest: float, dt: float, window: float) -> float:
     """Return for how long [s] the goal has not come nearer, `before` until a tick of dt [s] ago.
 
     left [s] away now, `nearest` it ever was. At GAIN of full speed the time stands still, faster it falls; half of what
     was left in a `window` [s] is enough: the last of a way is slow. It also falls while the tip moves fast, twice as
-    quickly as it grew: who trembles is idle all the same.
+    quickly as it grew: who trembles gets nowhere all the same.
     """
     if not slow(p):
         return max(0.0, before - 2.0 * dt)
-    pace = min(GAIN, 0.5 * nearest / window)
-    return max(0.0, before + dt - max(0.0, nearest - left) / max(pace, 1e-9))
+    needed = min(GAIN, 0.5 * nearest / window)
+    return max(0.0, before + dt - max(0.0, nearest - left) / max(needed, 1e-9))

@@ -165,7 +165,7 @@ def pack(
     at = _put_record(out, at, m.sent[0, :n], reals)
     out[at], out[at + 1], out[at + 2], out[at + 3] = o.command, m.cut, m.state, m.status
     out[at + 4] = m.blocker & _WORD
-    longs[0] = m.holders
+    longs[0] = m.blockers
     at = _put(out, at + 5, long)
     out[at], out[at + 1] = m.escape_phase, m.reaction
     longs[0] = m.in_force

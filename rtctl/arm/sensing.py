@@ -145,7 +145,7 @@ def detect_faults(c: Any, m: Any, f: Feedback, A: F64, around: Surroundings, imp
     )  # fmt: skip
     lost = m.cut & _NON_FINITE != 0 or not math.isfinite(m.innovation)
     evidence = Evidence(
-        seen, age, feed_age, f.missed, active, powered, implausible, m.pulled != 0, m.recovering != 0, lost,
+        seen, age, feed_age, f.missed, active, powered, implausible, m.slew_follows_echo != 0, m.recovering != 0, lost,
         m.has_goal != 0, m.innovation,
     )  # fmt: skip
     k = m.counters

@@ -152,12 +152,17 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
         drive, keep = np.zeros(n), _damped_stop(c, m, f, model.g)
     command = _torque_asked(c, m, f)
     on = command == _TORQUE
-    rows, cut, _, pulled = command_torque(
+    rows, cut, _, follows = command_torque(
         drive, keep, m.qd[:n].copy(), m.sent[:, :n].copy(), f.tau, f.age, c.tau_max[:n].copy(), c.tau_rate[:n].copy(),
         c.tau_lsb[:n].copy(), c.stop_damping[:n].copy(), model.A_inv, model.h, model.g, c.viscous[:n].copy(), c.dt,
         on, on and m.state != _ARMED,  # in ARMED brakes may still hold the arm
     )  # fmt: skip
-    m.sent[:, :n], m.qdd[:n], m.cut, m.pulled = rows[1:5], rows[5], cut | m.cut, 1 if pulled else 0
+    m.sent[:, :n], m.qdd[:n], m.cut, m.slew_follows_echo = (
+        rows[1:5],
+        rows[5],
+        cut | m.cut,
+        1 if follows else 0,
+    )
     return command, rows[0].copy()
 
 
@@ -178,7 +183,7 @@ def _act(
     field = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0])
     task, torques, seen, nearest, _, m.cut = _evaluate(
         arm.constants, arm.radius, arm.link, field, at, space, around.obstacles, q, qd, xd, omega, e, e_rot,
-        m.v_ref.copy(), m.w_ref.copy(), q_rest, m.pace,
+        m.v_ref.copy(), m.w_ref.copy(), q_rest, m.speed_scale,
     )  # fmt: skip
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin

@@ -100,8 +100,8 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
 def free_of_goals(m: Memory) -> Memory:
     """Return the memory without a goal and what was known of it."""
     return m._replace(
-        goal=None, status=Status.NO_GOAL, blocker=-1, holders=0, held=(), still=0, nearest=np.inf, idle=0.0,
-        escape=Escape(),
+        goal=None, status=Status.NO_GOAL, blocker=-1, blockers=0, blocked_by=(), still=0, nearest=np.inf,
+        stall_timer=0.0, escape=Escape(),
     )  # fmt: skip
 
 

@@ -12,14 +12,14 @@ from rtctl.arm.escape import Escape, Phase, advance, push_along, way
 from rtctl.arm.faults import BRAKES
 from rtctl.arm.law import motion_params
 from rtctl.arm.model import Model
-from rtctl.arm.progress import STILL_SPEED, Progress, arrived, at_rest, idle, time_left
+from rtctl.arm.progress import STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
 from rtctl.arm.task import point_along, selected, task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, norm
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, TOOL_Z, State, Status
 
-START_PACE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
+START_SPEED_SCALE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
 SLOW_REFERENCE = 1e-3  # [m/s, rad/s] below it braking is over
 
@@ -130,7 +130,9 @@ def wanted(c: Any, m: Any, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
     """
     n = model.q.shape[0]
     braking, pursuing = _braking(m), pursues(m)
-    m.pace = START_PACE if m.state == _ARMED or m.recovering != 0 else min(1.0, m.pace + c.dt / START_TIME)
+    m.speed_scale = (
+        START_SPEED_SCALE if m.state == _ARMED or m.recovering != 0 else min(1.0, m.speed_scale + c.dt / START_TIME)
+    )
     slow = braking and greater(_largest_size(m.v_ref), _largest_size(m.w_ref)) < SLOW_REFERENCE
     if braking and not slow:
         _hold_here(c, m)  # the hold begins where the braking ends
@@ -151,8 +153,8 @@ def wanted(c: Any, m: Any, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
 def _forget_goal(m: Any) -> None:
     m.has_goal, m.goal_task, m.goal_tolerance, m.goal_tolerance_rot, m.has_posture = 0, 0, 0.0, 0.0, 0
     m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:] = 0.0, 0.0, 0.0, 0.0
-    m.status, m.still, m.nearest, m.idle = _NO_GOAL, 0, np.inf, 0.0
-    m.blocker, m.holders = -1, np.uint64(0)
+    m.status, m.still, m.nearest, m.stall_timer = _NO_GOAL, 0, np.inf, 0.0
+    m.blocker, m.blockers = -1, np.uint64(0)
     _no_escape(m)
 
 
@@ -166,14 +168,14 @@ def _no_escape(m: Any) -> None:
 def _take_status(m: Any, status: int) -> int:
     if m.status == status:
         return SAME
-    m.status, m.blocker, m.holders = status, -1, np.uint64(0)
+    m.status, m.blocker, m.blockers = status, -1, np.uint64(0)
     return WORDS
 
 
 @kernel
 def _waited(c: Any, m: Any) -> bool:
     """Return whether the arm has been at rest, or got no nearer to its goal, for long enough to ask what holds it."""
-    return bool(max(m.still * c.dt, m.idle) >= c.stop_stall - 0.5 * c.dt)
+    return bool(max(m.still * c.dt, m.stall_timer) >= c.stop_stall - 0.5 * c.dt)
 
 
 @kernel
@@ -194,7 +196,7 @@ def progress_timers(c: Any, m: Any, target: Target, p: Progress) -> int:
         return SAME
     before = _waited(c, m)
     left = time_left(p, c.motion_v_max, c.motion_w_max)
-    m.idle = idle(m.idle, p, left, m.nearest, c.dt, c.stop_stall)
+    m.stall_timer = stall_timer(m.stall_timer, p, left, m.nearest, c.dt, c.stop_stall)
     m.nearest = min(left, m.nearest)
     m.still = m.still + 1 if at_rest(p) else 0
     if c.escape != 0.0 and m.escape_phase == _NONE and m.still == int(c.escape_ticks):

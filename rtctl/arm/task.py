@@ -149,11 +149,6 @@ def point_along(task: int, position: F64, free: F64) -> F64:
     return out
 
 
-def wholly_placed(goal: Goal) -> bool:
-    """Return whether the goal constrains all three coordinates of the tip."""
-    return int(goal.task) & _POSITION == _POSITION
-
-
 def within(task: Task, axes: Task) -> tuple[Task, str]:
     """Return what of a task an arm that moves along `axes` can do, or why it can do none of it.
 

@@ -158,12 +158,12 @@ def _with_meshes(memory: Memory, robot: Robot) -> Memory:
 def _check(memory: Memory, template: Memory) -> None:
     """Raise ValueError where a field could not stand in the template's place."""
     for name in Memory.__struct_fields__:
-        if name != "held":
+        if name != "blocked_by":
             _like(getattr(memory, name), getattr(template, name), name)
     if memory.n != template.n:
         raise ValueError("not a checkpoint of this robot: joints")
-    if not isinstance(memory.held, tuple) or not all(isinstance(text, str) for text in memory.held):
-        raise ValueError("not a checkpoint: held")
+    if not isinstance(memory.blocked_by, tuple) or not all(isinstance(text, str) for text in memory.blocked_by):
+        raise ValueError("not a checkpoint: blocked_by")
     h = record_of(memory.hot)[0]
     kinds = {
         "state": State, "reaction": Severity, "status": Status, "task": Task, "goal_task": Task, "hold_task": Task,
