@@ -13,10 +13,10 @@ import numpy as np
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import STOPS
 from rtctl.arm.flat import AGE, CLOUDS, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
-from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, _evaluate
+from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, _evaluate
 from rtctl.arm.limits import command_torque
 from rtctl.arm.model import Model
-from rtctl.arm.osc import OperationalSpace
+from rtctl.arm.osc import OperationalSpace, Twist
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
 from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torque, plausible_feedback, predict
@@ -183,8 +183,11 @@ def _act(
         )  # fmt: skip
     field = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0])
     task, torques, seen, nearest, _, m.cut = _evaluate(
-        arm.constants, arm.radius, arm.link, field, at, space, around.obstacles, q, qd, xd, omega, e, e_rot,
-        m.v_ref.copy(), m.w_ref.copy(), q_rest, m.pace,
+        arm.constants, Cover(arm.radius, arm.link), field, at, space, around.obstacles,
+        Motion(
+            q, qd, Twist(xd, omega), Twist(e, e_rot), Twist(m.v_ref.copy(), m.w_ref.copy()), q_rest, m.pace,
+            m.qdd[:n].copy(),
+        ),
     )  # fmt: skip
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin
