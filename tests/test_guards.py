@@ -21,9 +21,9 @@ from rtctl.arm.bounds import (
 from rtctl.arm.field import Field, MovingPoints, field, field_buffers, field_params
 from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
 from rtctl.arm.joint_field import own_field
-from rtctl.arm.least_change import ROWS_MAX, SOFTNESS, no_rows
+from rtctl.arm.least_change import SOFTNESS, rows_in, rows_sizes
 from rtctl.arm.model import Model
-from rtctl.arm.nearby import Nearby, candidates_at_most, look_near, nearby_in
+from rtctl.arm.nearby import Nearby, look_near, nearby_in
 from rtctl.arm.scaling import scale_to_limits
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import obstacles_empty, with_shape
@@ -41,7 +41,7 @@ def bounds_of(low: F64, high: F64, rows: F64 | None = None, most: F64 | None = N
 
 def looked(points: MovingPoints, seen: Field, qd: F64, zone: float, braking: float, rate: F64) -> Nearby:
     """Return the points nearer than `zone` [m] to obstacles, with their cheap bounds."""
-    room, m, n = candidates_at_most(seen, zone), len(points.radius), len(qd)
+    room, m, n = len(seen.leader) * len(points.radius), len(points.radius), len(qd)
     whole, real = np.zeros(3 * room + 1, np.int64), np.zeros(room + 4 * m + n + 1)
     views = getattr(nearby_in, "py_func", nearby_in)  # a leaf kernel gives arrays to leaf kernels alone
     whole[-1] = look_near(views(whole, real, points, seen, qd, braking, rate), zone)
@@ -56,7 +56,8 @@ def sent_of(
     n, work = len(tau), np.zeros((2, len(tau)))
     if let_pass(inertia, motors, tau, bounds, near, work):
         return work[0], False
-    rows = no_rows(n, ROWS_MAX)
+    real, whole = rows_sizes(n)
+    rows = getattr(rows_in, "py_func", rows_in)(np.zeros(real), np.zeros(whole, np.int64), n)
     rows.x[0] = 0.0 if start is None else start
     acts = hold_back(rows, inertia, motors, tau, bounds, near, np.zeros(2 * n + len(bounds.most), np.int64), work)
     return work[0], acts

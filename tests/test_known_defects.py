@@ -35,17 +35,22 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
     for k, shape in enumerate(shapes):
         table = with_shape(table, k, shape)
     space = osc.operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), arm.motion)
-    return law.evaluate_law(arm, model, space, table, q, np.zeros(7), ZERO, ZERO, e, ZERO, e, ZERO, q, 1.0, np.zeros(7))
+    return law.evaluate_law(
+        arm, model, space, table,
+        law.Motion(
+            q, np.zeros(7), osc.Twist(ZERO, ZERO), osc.Twist(e, ZERO), osc.Twist(e, ZERO), q, 1.0, np.zeros(7)
+        ),
+    )  # fmt: skip
 
 
 def interpreted(patch: Patch) -> None:
     """Let the law look its parts up when it runs, so that one of them can be exchanged."""
-    whole = law._evaluate.py_func
-    parts = "_params _motion_limits _torques _bound _bounds _approach _near _let_pass _hold_back nearby_in"
-    for part in parts.split():
+    whole = law.law.py_func
+    parts = "_work_in rows_in _params _motion_limits _torques _bound _bounds _approach _near nearby_in"
+    for part in (*parts.split(), "_let_pass", "_hold_back"):
         patch.setattr(law, part, getattr(law, part).py_func)
-    patch.setattr(law, "_evaluate", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
-    patch.setattr(servo_level, "_evaluate", law._evaluate)
+    patch.setattr(law, "law", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
+    patch.setattr(servo_level, "law", law.law)
     patch.setattr(servo_level, "_act", servo_level._act.py_func)
     patch.setattr(pipe, "servo", servo_level.servo.py_func)
 
@@ -158,17 +163,16 @@ def the_arm_stops_before_a_ball_on_its_line() -> bool:
 
 def test_avoidance_goes_before_the_goal(monkeypatch: Patch):
     assert the_arm_stops_before_a_ball_on_its_line()
-    true_law = servo_level._evaluate
+    true_law = servo_level.law
 
     def in_the_null_space(*arguments: Any) -> Any:
-        out, space = true_law(*arguments), arguments[4]
-        torques = out[1]
+        out, space, torques = true_law(*arguments), arguments[4], arguments[8].torques
         projected = space.NT @ torques[law.OBSTACLES]
         torques[law.KEEP] += projected - torques[law.OBSTACLES]
         torques[law.OBSTACLES] = projected
         return out
 
-    monkeypatch.setattr(servo_level, "_evaluate", in_the_null_space)
+    monkeypatch.setattr(servo_level, "law", in_the_null_space)
     monkeypatch.setattr(servo_level, "_act", servo_level._act.py_func)
     monkeypatch.setattr(pipe, "servo", servo_level.servo.py_func)  # looks its parts up when it runs
     assert not the_arm_stops_before_a_ball_on_its_line()

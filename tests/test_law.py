@@ -10,9 +10,9 @@ import pytest
 
 from rtctl.arm.bounds import SPEED_HORIZON
 from rtctl.arm.field import MovingPoints, move_points
-from rtctl.arm.law import Law, evaluate_law
+from rtctl.arm.law import Law, Motion, evaluate_law
 from rtctl.arm.model import Model
-from rtctl.arm.osc import operational_space
+from rtctl.arm.osc import Twist, operational_space
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 from tests.arms import PANDA, PANDA_HOME, PANDA_JOINTS, Bullet, states
@@ -50,12 +50,12 @@ def law_at(q: F64, qd: F64 | None = None, balls: tuple[tuple[float, ...], ...] =
     model = model_at(q, qd)
     space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6)[: changes.pop("rows", 6)], arm.motion)
     twist = model.J @ qd
-    inputs: dict[str, Any] = {
-        "model": model, "space": space, "obstacles": space_of(balls), "q": q, "qd": qd, "xd": twist[:3],
-        "omega": twist[3:], "e": ZERO, "e_rot": ZERO, "v_ref": ZERO, "w_ref": ZERO, "q_rest": q, "pace": 1.0,
-        "qdd": np.zeros(7),
-    }  # fmt: skip
-    return evaluate_law(arm, **(inputs | changes))
+    model, space = changes.pop("model", model), changes.pop("space", space)
+    obstacles = changes.pop("obstacles", space_of(balls))
+    still = Twist(ZERO, ZERO)
+    error, previous = Twist(changes.pop("e", ZERO), ZERO), Twist(changes.pop("v_ref", ZERO), ZERO)
+    motion = Motion(q, qd, Twist(twist[:3], twist[3:]), still, still, q, 1.0, np.zeros(7))
+    return evaluate_law(arm, model, space, obstacles, motion._replace(error=error, previous=previous, **changes))
 
 
 def test_an_arm_at_its_goal_is_carried_by_gravity_torque_alone(bullet: Bullet):
@@ -137,7 +137,7 @@ def test_points_moved_between_evaluations_are_off_by_the_square_of_the_step():
 
 def test_a_slow_start_bounds_what_joints_are_asked_for():
     balls = ((0.307, 0.0, 0.44, 0.03),)
-    full, slow = law_at(PANDA_HOME, balls=balls), law_at(PANDA_HOME, balls=balls, pace=0.1)
+    full, slow = law_at(PANDA_HOME, balls=balls), law_at(PANDA_HOME, balls=balls, speed_scale=0.1)
     model = model_at(PANDA_HOME, np.zeros(7))
     for law, pace in ((full, 1.0), (slow, 0.1)):
         qdd = model.A_inv @ (law.drive + law.keep - model.g)

@@ -15,12 +15,12 @@ import numpy as np
 from rtctl import design as cfg
 from rtctl.app.arm_link import link_spec
 from rtctl.arm import bounds, least_change, nearby, osc, scaling
+from rtctl.arm.law import Motion, prepared
 from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model
-from rtctl.arm.osc import operational_space
+from rtctl.arm.osc import OperationalSpace, Twist, operational_space
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
-from rtctl.control.firas import field_buffers
 from rtctl.hal.can.link import LinkSpec
 from rtctl.hal.can.transport import Seqpacket
 from rtctl.protocol import e2e, frame, mit
@@ -164,12 +164,13 @@ class Null:
 
 
 class Case(NamedTuple):
-    """One size of the law: its arguments, and those of the floor."""
+    """One size of the law: the arguments of `evaluate_law`, and so those of the floor."""
 
     robot: Robot
     model: Model
+    space: OperationalSpace
     obstacles: Obstacles
-    arguments: tuple[Any, ...]
+    motion: Motion
 
 
 def case(robot: Robot, m: int, slots: int) -> Case:
@@ -195,16 +196,16 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         away *= (points.radius[j] + 0.05 + rng.uniform(0.3, 0.9) * robot.avoid.rho0) / np.sqrt((away**2).sum())
         ball = shape(f"ball{k}", "sphere", (0.05,), model.P[j] + away, 0.1 * rng.normal(size=3))
         obstacles = with_shape(obstacles, k, ball)
-    small = robot._replace(points=points, slots=slots, scratch=field_buffers(slots, m, robot.n))
+    small = prepared(robot._replace(points=points, slots=slots))
     space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), robot.motion)
     twist = model.J @ qd
     e, e_rot = np.array([0.1, 0.2, -0.05]), np.array([0.1, 0.0, 0.2])
     v_ref, w_ref = np.array([0.05, 0.05, 0.0]), np.array([0.1, 0.0, 0.1])
-    arguments = (
-        small, model, space, obstacles, q + 0.002, qd, twist[:3].copy(), twist[3:].copy(), e, e_rot, v_ref, w_ref,
-        robot.q_rest, 1.0, np.zeros(robot.n),
+    motion = Motion(
+        q + 0.002, qd, Twist(twist[:3].copy(), twist[3:].copy()), Twist(e, e_rot), Twist(v_ref, w_ref), robot.q_rest,
+        1.0, np.zeros(robot.n),
     )  # fmt: skip
-    return Case(small, model, obstacles, arguments)
+    return Case(small, model, space, obstacles, motion)
 
 
 def _spread(total: int, count: int) -> I64:
@@ -252,7 +253,8 @@ class BoundFloor:
 
     def __init__(self, library: ctypes.CDLL, case: Case) -> None:
         self._library = library
-        r, model, space, obstacles, q, qd, xd, omega, e, e_rot, v_ref, w_ref, q_rest, _, qdd = case.arguments
+        r, model, space, obstacles, motion = case
+        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd = motion
         p, a, b = r.motion, r.avoid, r.limit
         self._arrays = [
             np.ascontiguousarray(each, np.float64)

@@ -261,8 +261,8 @@ void guarded(const double *const *a, const double *s, const double *load, int n,
     mv(a[A_INV], tau, n, n, wanted);
     if (!passed(a, wanted, n, m)) {
         for (int i = 0; i < n; i++) less[i] = f * tau[i];
-        mv(a[A_INV], less, n, n, d);
-        if (!passed(a, d, n, m)) {
+        if (f < 1) mv(a[A_INV], less, n, n, d);
+        if (f == 1 || !passed(a, d, n, m)) {
             f = fitting(less, load, a[TAU_MAX], s[SHARE], n);
             for (int i = 0; i < n; i++) tau[i] = f * less[i];
             return;

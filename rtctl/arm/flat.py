@@ -134,9 +134,8 @@ MARGIN, AGE, RHO, GOAL_RHO = 12, 13, 14, 15
 
 
 @kernel
-def field_in(reals: F64, wholes: I64, n: int, m: int) -> Field:
-    """Return the work arrays of the field in two flat ones; see `field_sizes`."""
-    slots = wholes.shape[0] // (3 + m)
+def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
+    """Return the work arrays of the field at the head of two flat ones; see `field_sizes`."""
     a = n + 4 * slots
     b = a + 6 * slots * m
     c = b + 15 * m
@@ -144,7 +143,7 @@ def field_in(reals: F64, wholes: I64, n: int, m: int) -> Field:
         reals[:n], reals[n : n + slots], wholes[:slots], reals[n + slots : a].reshape(slots, 3),
         reals[a:b].reshape(slots, 6, m), reals[b:c].reshape(15, m),
         reals[c : c + slots * (n + 1)].reshape(slots, n + 1), wholes[slots : 2 * slots],
-        wholes[3 * slots :].reshape(slots, m), wholes[2 * slots : 3 * slots],
+        wholes[3 * slots : (3 + m) * slots].reshape(slots, m), wholes[2 * slots : 3 * slots],
     )  # fmt: skip
 
 

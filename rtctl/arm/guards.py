@@ -125,13 +125,6 @@ def nearest_kept(s: Rows, inertia: Inertia, wanted: F64, bounds: Bounds, made: I
 
 
 @leaf_kernel
-def _scaled(tau: F64, load: F64, tau_max: F64, out: F64) -> None:
-    share = scale_to_limits(tau, load, tau_max)
-    for i in range(tau.shape[0]):
-        out[i] = share * tau[i]
-
-
-@leaf_kernel
 def _product(M: F64, v: F64, out: F64) -> None:
     for i in range(v.shape[0]):
         out[i] = dot(M, i, v)
@@ -146,11 +139,16 @@ def let_pass(inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: N
     _product(inertia.A_inv, tau, work[0])
     if passed(work[0], bounds, near):
         return False
-    _scaled(tau, motors.load, motors.tau_max, work[1])
-    _product(inertia.A_inv, work[1], work[0])
-    if passed(work[0], bounds, near):
-        return False
-    _scaled(work[1], motors.load, motors.tau_max, work[0])
+    share = scale_to_limits(tau, motors.load, motors.tau_max)
+    for i in range(tau.shape[0]):
+        work[1, i] = share * tau[i]
+    if share < 1.0:
+        _product(inertia.A_inv, work[1], work[0])
+        if passed(work[0], bounds, near):
+            return False
+        share = scale_to_limits(work[1], motors.load, motors.tau_max)
+    for i in range(tau.shape[0]):
+        work[0, i] = share * work[1, i]
     return True
 
 
@@ -164,9 +162,12 @@ def hold_back(
     the same for every point near an obstacle. Where not all can be kept the joints' bounds are.
     What the motors lack is taken from what was wanted first, so that braking keeps its strength.
     The search begins at s.x[0] (n,) [rad/s2], accelerations near the answer as those of the tick before are: what they
-    pass it will pass. made (2n + r,): zeros.
+    pass it will pass. made (2n + r,): work.
     """
     n, acts, sent, wanted, share = tau.shape[0], False, s.sent, s.wanted, 1.0
+    s.numbers[COUNT] = 0
+    for r in range(made.shape[0]):
+        made[r] = 0
     for i in range(n):
         if not math.isfinite(s.x[0, i]):  # of a tick that was not a number; the next may be one again
             s.x[0, i] = 0.0

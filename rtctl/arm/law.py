@@ -23,9 +23,9 @@ from rtctl.arm.field import (
 )
 from rtctl.arm.flat import field_in, field_sizes
 from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
-from rtctl.arm.least_change import ROWS_MAX, Rows, no_rows
+from rtctl.arm.least_change import Rows, rows_in, rows_sizes
 from rtctl.arm.model import Model
-from rtctl.arm.nearby import APPROACH_ZONE, Nearby, candidates_at_most, look_near, nearby_in
+from rtctl.arm.nearby import APPROACH_ZONE, CANDIDATES_MAX, Nearby, look_near, nearby_in
 from rtctl.arm.osc import (
     POSTURE_DAMPER,
     POSTURE_SPRING,
@@ -140,43 +140,23 @@ class Motion(NamedTuple):
 
     q: F64  # (n,) [rad] now
     qd: F64  # (n,)
-    actual: Twist  # the tip's velocity
-    error: Twist  # the way to go
+    actual: Twist  # the tip's velocity [m/s, rad/s]
+    error: Twist  # the way to go [m, rad]
     previous: Twist  # velocity references of the last tick
     q_rest: F64  # (n,) [rad] the posture
     speed_scale: float  # fraction of qd_max that joints may have
     qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
 
 
-def evaluate_law(
-    robot: Robot,
-    model: Model,
-    space: OperationalSpace,
-    obstacles: Obstacles,
-    q: F64,
-    qd: F64,
-    xd: F64,
-    omega: F64,
-    e: F64,
-    e_rot: F64,
-    v_ref: F64,
-    w_ref: F64,
-    q_rest: F64,
-    pace: float,
-    qdd: F64,
-) -> Law:
-    """Return the torques that take the tip along e (3,) [m] and e_rot (3,) [rad], and off whatever is near.
+def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles: Obstacles, motion: Motion) -> Law:
+    """Return the torques of `law` that take the tip where the motion wants it, and off whatever is near.
 
-    q, qd (n,) now; xd, omega (3,) the tip's velocity; v_ref, w_ref (3,) the references of the previous tick;
-    q_rest (n,) the posture; pace: the fraction of qd_max that joints may have; qdd (n,)
-    [rad/s2] of the last tick, where the guards begin to search. e = e_rot = 0 with nonzero references
-    brakes along the path.
+    An error of zero with references that are not brakes along the path.
     """
-    motion = Motion(q, qd, Twist(xd, omega), Twist(e, e_rot), Twist(v_ref, w_ref), q_rest, pace, qdd)
-    points = robot.points
-    return Law(
-        *_evaluate(robot.constants, Cover(points.radius, points.link), robot.scratch, model, space, obstacles, motion)
-    )
+    out = outputs(robot.n, len(obstacles.active))
+    cover, memory = Cover(robot.points.radius, robot.points.link), WorkMemory(*robot.work)
+    rho_self, cut = law(robot.constants, cover, robot.scratch, model, space, obstacles, motion, memory, out)
+    return Law(out.task, out.torques, out.seen, out.nearest, rho_self, cut)
 
 
 def prepared(robot: Robot) -> Robot:
@@ -212,9 +192,9 @@ def prepared(robot: Robot) -> Robot:
         else:
             constants[k] = v
     m = len(robot.points.radius)
-    reals, wholes = field_sizes(robot.slots, m, robot.n)
+    reals, wholes = work_sizes(robot.slots, m, robot.n, len(robot.own.pairs))
     work = np.zeros(reals), np.zeros(wholes, np.int64)
-    return robot._replace(constants=constants, work=work, scratch=field_in(*work, robot.n, m))
+    return robot._replace(constants=constants, work=work, scratch=field_in(*work, robot.n, m, robot.slots))
 
 
 @kernel
@@ -281,13 +261,61 @@ class Cover(NamedTuple):
     link: I64  # (m,)
 
 
+class WorkMemory(NamedTuple):
+    """Two flat arrays, first the field's (`flat.field_in`), then the law's; what a tick leaves there no other reads."""
+
+    reals: F64
+    wholes: I64
+
+
+class Outputs(NamedTuple):
+    """Where the law writes what `Law` names alike."""
+
+    task: F64  # (12,)
+    torques: F64  # (7, n)
+    seen: F64  # (4 K,)
+    nearest: I32  # (K,)
+
+
+@kernel
+def outputs(n: int, slots: int) -> Outputs:
+    """Return the arrays of n joints and K = `slots` obstacles."""
+    return Outputs(np.empty(12), np.empty((7, n)), np.empty(4 * slots), np.empty(slots, np.int32))
+
+
 class _Work(NamedTuple):
-    """Arrays that a tick makes for itself."""
+    """Arrays that a tick works in."""
 
     w: F64  # (rows, n) as above
     most: F64  # (r,) bounds of the rows from _ROWS on
-    whole: I64  # of the candidates; see `nearby.nearby_in`
-    real: F64
+    real: F64  # of the candidates; see `nearby.nearby_in`
+    whole: I64
+    made: I64  # (2n + r,) of the guards
+    rows: Rows
+
+
+def work_sizes(slots: int, m: int, n: int, pairs: int) -> tuple[int, int]:
+    """Return the sizes of the WorkMemory of K = `slots` obstacles, m points, n joints, L = `pairs` pairs of links."""
+    (a, b), (c, d) = field_sizes(slots, m, n), rows_sizes(n)
+    candidates, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    return a + (_ROWS + known) * n + known + candidates + 4 * m + n + 1 + c, b + 3 * candidates + 1 + 2 * n + known + d
+
+
+@leaf_kernel
+def _work_in(memory: WorkMemory, slots: int, m: int, n: int, pairs: int) -> _Work:
+    """Return the law's arrays in the memory; see `work_sizes`."""
+    c, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    a, b = n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)
+    most = a + (_ROWS + known) * n
+    real = most + known
+    rows = real + c + 4 * m + n + 1
+    made = b + 3 * c + 1
+    end = made + 2 * n + known
+    return _Work(
+        memory.reals[a:most].reshape(_ROWS + known, n), memory.reals[most:real], memory.reals[real:rows],
+        memory.wholes[b:made], memory.wholes[made:end],
+        rows_in(memory.reals[rows:], memory.wholes[end:], n),
+    )  # fmt: skip
 
 
 @leaf_kernel
@@ -369,15 +397,16 @@ def _let_pass(constants: Record, cover: Cover, seen: Field, model: Model, motion
 
 @leaf_kernel
 def _hold_back(
-    constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work, rows: Rows, made: I64
+    constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work
 ) -> bool:  # fmt: skip
     """Write what the guards let pass into row _SENT of the work, which `_let_pass` left; return whether any acts."""
     c, w = constants[0], work.w
     near = _near(constants, cover, seen, model, motion, work)
     inertia, motors = Inertia(model.A, model.A_inv), Motors(w[_LOAD], c.tau_max[: motion.q.shape[0]])
     for i in range(motion.q.shape[0]):
-        rows.x[0, i] = motion.qdd[i]
-    return hold_back(rows, inertia, motors, w[_SUM], _bounds(w, work.most), near, made, w[_SENT : _LESS + 1])
+        work.rows.x[0, i] = motion.qdd[i]
+    bounds = _bounds(w, work.most)
+    return hold_back(work.rows, inertia, motors, w[_SUM], bounds, near, work.made, w[_SENT : _LESS + 1])
 
 
 @leaf_kernel
@@ -406,30 +435,26 @@ def _copy_seen(seen: Field, rho_force: F64, nearest: I32) -> None:
             rho_force[slots + 3 * k + i] = seen.force[k, i]
 
 
-@kernel
-def _evaluate(
+@leaf_kernel
+def law(
     constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace, obstacles: Obstacles,
-    motion: Motion,
-) -> tuple[F64, F64, F64, I32, float, int]:  # fmt: skip
-    """Return the fields of `Law`.
+    motion: Motion, memory: WorkMemory, out: Outputs,
+) -> tuple[float, int]:  # fmt: skip
+    """Write the torques of a tick into `out`; return the least distance between links [m], and Law.cut.
 
-    One compiled call with few results: crossing the border costs as much as a term, and a tenth of that per array.
+    The whole law is one kernel without an array of its own, so that nothing is counted or allocated on the way.
     """
-    n, m, slots, known = motion.q.shape[0], cover.radius.shape[0], seen.leader.shape[0], 1 + model.own_rho.shape[0]
-    task, torques, w, most = np.empty(12), np.empty((7, n)), np.empty((_ROWS + known, n)), np.empty(known)
-    rho_force, nearest = np.empty(4 * slots), np.empty(slots, np.int32)
-    rho_self, flags, share = _torques(constants, cover, seen, model, space, obstacles, motion, task, w)
-    _bound(constants, model, motion, w, most)
-    count = candidates_at_most(seen, APPROACH_ZONE * constants[0].avoid_rho0)
-    work = _Work(w, most, np.zeros(3 * count + 1, np.int64), np.empty(count + 4 * m + n + 1))
+    n = motion.q.shape[0]
+    work = _work_in(memory, seen.leader.shape[0], cover.radius.shape[0], n, model.own_rho.shape[0])
+    rho_self, flags, share = _torques(constants, cover, seen, model, space, obstacles, motion, out.task, work.w)
+    _bound(constants, model, motion, work.w, work.most)
     acts = False
     if not _let_pass(constants, cover, seen, model, motion, work):
-        rows, made = no_rows(n, ROWS_MAX), np.zeros(2 * n + known, np.int64)
-        acts = _hold_back(constants, cover, seen, model, motion, work, rows, made)
-    _write(w, share, torques)
-    _copy_seen(seen, rho_force, nearest)
+        acts = _hold_back(constants, cover, seen, model, motion, work)
+    _write(work.w, share, out.torques)
+    _copy_seen(seen, out.seen, out.nearest)
     cut = _CAP if flags & CAPPED else 0
     cut |= _SPEED if acts else 0
     cut |= _SINGULAR if space.damped else 0
     cut |= _SCALED if share < 1.0 else 0
-    return task, torques, rho_force, nearest, rho_self, cut
+    return rho_self, cut

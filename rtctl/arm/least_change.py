@@ -16,9 +16,7 @@ Rows need not be there at once: more may be added between two steps.
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from rtctl.kernel import kernel, leaf_kernel
+from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
 
 ROWS_MAX = 512  # at a time; a crowd of 64 obstacles that press from all sides makes 150
@@ -43,12 +41,22 @@ class Rows(NamedTuple):
     numbers: I64  # (2,) rows, steps done
 
 
-@kernel
-def no_rows(n: int, r: int) -> Rows:
-    """Return none for n joints, and room for r."""
+def rows_sizes(n: int) -> tuple[int, int]:
+    """Return how many real and whole numbers the arrays of `rows_in` are, for n joints."""
+    return ROWS_MAX * (n + 4) + n * n + 4 * n, 2
+
+
+@leaf_kernel
+def rows_in(real: F64, whole: I64, n: int) -> Rows:
+    """Return room for ROWS_MAX rows of n joints in two flat arrays; see `rows_sizes`."""
+    r = ROWS_MAX
+    a = r * n
+    b = a + 4 * r
+    c = b + n * n
     return Rows(
-        np.empty((r, n)), np.empty(r), np.empty(r), np.empty((2, r)), np.empty((n, n)), np.empty((2, n)),
-        np.empty(n), np.empty(n), np.zeros(2, np.int64),
+        real[:a].reshape(r, n), real[a : a + r], real[a + r : a + 2 * r], real[a + 2 * r : b].reshape(2, r),
+        real[b:c].reshape(n, n), real[c : c + 2 * n].reshape(2, n), real[c + 2 * n : c + 3 * n],
+        real[c + 3 * n : c + 4 * n], whole[:2],
     )  # fmt: skip
 
 

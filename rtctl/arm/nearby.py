@@ -54,16 +54,6 @@ def nearby_in(
 
 
 @leaf_kernel
-def candidates_at_most(seen: Field, zone: float) -> int:
-    """Return how many points can be nearer than `zone` [m] to an obstacle, CANDIDATES_MAX at most."""
-    count = 0
-    for k in range(seen.leader.shape[0]):
-        if seen.leader[k] >= 0 and seen.rho_min[k] < zone:
-            count += seen.near_count[k]
-    return min(count, CANDIDATES_MAX)
-
-
-@leaf_kernel
 def candidates(seen: Field, points: MovingPoints, zone: float, out: Candidates) -> int:
     """List the points nearer than `zone` [m] to an obstacle that are the nearest of their link, or nearly so.
 
@@ -98,6 +88,8 @@ def cheap_bounds(size: int, near: Nearby) -> None:
     row = -n^T Jp, so the speed is -n . v and the mobility n^T B n. The jerk is at least what it would be if one joint
     moved the point along n with all of its column: |row_i| <= |Jp_i|.
     """
+    if size == 0:
+        return
     out, seen, points, tau_rate = near.found, near.seen, near.points, near.tau_rate
     for j in range(points.radius.shape[0]):
         out.points[3, j] = -1.0
@@ -125,8 +117,6 @@ def look_near(near: Nearby, zone: float) -> int:
 
     It is the arm's own approach -n . Jp qd alone that is bounded; what comes towards it is for the field to flee.
     """
-    if near.found.most.shape[0] == 0:
-        return 0
     size = candidates(near.seen, near.points, zone, near.found)
     cheap_bounds(size, near)
     return size
