@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from rtctl.arm.field import CONTACT, field, field_buffers, field_params
+from rtctl.arm.field import CONTACT, MovingPoints, field, field_buffers, field_params
 from rtctl.design.assets import load_cloud, load_mesh, packed
 from rtctl.errors import ConfigError
 from rtctl.spec.files import read_cloud
@@ -240,7 +240,9 @@ def repelled(o: Obstacles, P: F64, radius: F64, prefilter: bool = True, seed: in
     A_inv = np.linalg.inv(M @ M.T + np.eye(n))
     B = np.einsum("jid,de,jke->jik", Jp, A_inv, Jp).copy()
     out, link = field_buffers(o.active.shape[0], m, n), np.sort(rng.integers(1, n + 1, m))
-    flags = field(P, Jp, B, rng.normal(size=n) * 0.3, radius, link, o, PARAMS, out, True, prefilter)
+    flags = field(
+        MovingPoints(P, Jp, B, radius, link), np.zeros(n), rng.normal(size=n) * 0.3, o, PARAMS, out, True, prefilter
+    )
     return [a.tobytes() for a in (out.tau, out.rho_min, out.nearest, out.force)], out.tau.copy(), int(flags)
 
 
@@ -266,7 +268,14 @@ def test_one_that_appears_on_the_arm_pushes_out_with_a_bounded_force(kind: str) 
     for x in P:
         out = field_buffers(2, 1, 3)
         flags = field(
-            x[None], eye, eye, np.zeros(3), np.full(1, 0.02), np.ones(1, np.int64), o, PARAMS, out, True, True
+            MovingPoints(x[None], eye, eye, np.full(1, 0.02), np.ones(1, np.int64)),
+            np.zeros(3),
+            np.zeros(3),
+            o,
+            PARAMS,
+            out,
+            True,
+            True,
         )
         rho, n = distance(shape, x[None], MESHES)
         assert np.allclose(out.tau / np.linalg.norm(out.tau), n[0], atol=1e-9)

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from rtctl.arm.field import field, field_buffers
+from rtctl.arm.field import MovingPoints, field, field_buffers
 from rtctl.control.firas import FieldParams
 from rtctl.types import Shape
 from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
@@ -41,7 +41,7 @@ def flight(table: Obstacles, p: FieldParams, speed: float, offset: float, dt: fl
     one, link = EYE.reshape(1, 3, 3), np.ones(1, np.int64)
     least = most = 0.5 * speed * speed
     for _ in range(round(1.2 / speed / dt)):
-        field(x.reshape(1, 3), one, one, v, np.zeros(1), link, table, p, out, True, True)
+        field(MovingPoints(x.reshape(1, 3), one, one, np.zeros(1), link), ZERO, v, table, p, out, True, True)
         v, x = v + dt * a, x + dt * v + 0.5 * dt * dt * a
         a = out.tau.copy()  # acts a period after what it was computed from
         energy = 0.5 * float(v @ v) + potential(float(out.rho_min[0]), p)

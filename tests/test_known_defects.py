@@ -35,15 +35,22 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
     for k, shape in enumerate(shapes):
         table = with_shape(table, k, shape)
     space = osc.operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), arm.motion)
-    return law.evaluate_law(arm, model, space, table, q, np.zeros(7), ZERO, ZERO, e, ZERO, e, ZERO, q, 1.0)
+    return law.evaluate_law(
+        arm, model, space, table,
+        law.Motion(
+            q, np.zeros(7), osc.Twist(ZERO, ZERO), osc.Twist(e, ZERO), osc.Twist(e, ZERO), q, 1.0, np.zeros(7)
+        ),
+    )  # fmt: skip
 
 
 def interpreted(patch: Patch) -> None:
     """Let the law look its parts up when it runs, so that one of them can be exchanged."""
-    whole = law._evaluate.py_func
-    patch.setattr(law, "_params", law._params.py_func)
-    patch.setattr(law, "_evaluate", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
-    patch.setattr(servo_level, "_evaluate", law._evaluate)
+    whole = law.law.py_func
+    parts = "_work_in rows_in _params _motion_limits _torques _bound _bounds _approach _near nearby_in"
+    for part in (*parts.split(), "_let_pass", "_hold_back"):
+        patch.setattr(law, part, getattr(law, part).py_func)
+    patch.setattr(law, "law", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
+    patch.setattr(servo_level, "law", law.law)
     patch.setattr(servo_level, "_act", servo_level._act.py_func)
     patch.setattr(pipe, "servo", servo_level.servo.py_func)
 
@@ -97,7 +104,7 @@ def test_penetration_pushes_out(monkeypatch: Patch):
     true_field = law.field
 
     def flipping(*arguments: Any) -> int:
-        flags, seen = true_field(*arguments), arguments[8]
+        flags, seen = true_field(*arguments), arguments[5]
         if seen.rho_min.min() < 0.0:  # gradient of |distance|
             seen.tau[:] *= -1.0
         return int(flags)
@@ -119,7 +126,8 @@ def push_depends_on_the_gap_alone() -> bool:
         out = field_buffers(4, 1, 3)
         at = np.array([[radius + 0.04, 0.0, 0.0]])
         eye = np.eye(3).reshape(1, 3, 3)
-        law.field(at, eye, eye, ZERO, np.zeros(1), np.ones(1, np.int64), table, p, out, True, True)
+        points = law.MovingPoints(at, eye, eye, np.zeros(1), np.ones(1, np.int64))
+        law.field(points, ZERO, ZERO, table, p, out, True, True)
         forces.append(out.tau[0])
     wanted = p.eta * (1.0 / 0.04 - 1.0 / p.rho0) / 0.04**2
     return bool(np.allclose(forces, wanted, rtol=1e-9))
@@ -129,9 +137,9 @@ def test_the_gradient_of_the_distance_is_a_unit_vector(monkeypatch: Patch):
     assert push_depends_on_the_gap_alone()
     true_field = law.field
 
-    def unnormalised(P: F64, *arguments: Any) -> int:
-        flags, seen = true_field(P, *arguments), arguments[7]
-        seen.tau[:] *= np.linalg.norm(P[0])  # p - centre instead of its direction
+    def unnormalised(points: law.MovingPoints, *arguments: Any) -> int:
+        flags, seen = true_field(points, *arguments), arguments[4]
+        seen.tau[:] *= np.linalg.norm(points.P[0])  # p - centre instead of its direction
         return int(flags)
 
     monkeypatch.setattr(law, "field", unnormalised)
@@ -155,17 +163,16 @@ def the_arm_stops_before_a_ball_on_its_line() -> bool:
 
 def test_avoidance_goes_before_the_goal(monkeypatch: Patch):
     assert the_arm_stops_before_a_ball_on_its_line()
-    true_law = servo_level._evaluate
+    true_law = servo_level.law
 
     def in_the_null_space(*arguments: Any) -> Any:
-        out, space = true_law(*arguments), arguments[5]
-        torques = out[1]
+        out, space, torques = true_law(*arguments), arguments[4], arguments[8].torques
         projected = space.NT @ torques[law.OBSTACLES]
         torques[law.KEEP] += projected - torques[law.OBSTACLES]
         torques[law.OBSTACLES] = projected
         return out
 
-    monkeypatch.setattr(servo_level, "_evaluate", in_the_null_space)
+    monkeypatch.setattr(servo_level, "law", in_the_null_space)
     monkeypatch.setattr(servo_level, "_act", servo_level._act.py_func)
     monkeypatch.setattr(pipe, "servo", servo_level.servo.py_func)  # looks its parts up when it runs
     assert not the_arm_stops_before_a_ball_on_its_line()
@@ -337,11 +344,12 @@ def test_the_speed_limit_holds(monkeypatch: Patch):
     interpreted(monkeypatch)
     assert within_the_speed_limit()
 
-    def unlimited(e: F64, e_rot: F64, v: F64, w: F64, Jbar: F64, free: F64, qd_max: F64, k: float, *a: Any) -> Any:
-        return k * e, k * e_rot
+    def unlimited(error: osc.Twist, *a: Any) -> None:
+        p, out = a[-3], a[-1]
+        out.linear[:], out.angular[:] = p.k_p / p.k_v * error.linear, p.k_p / p.k_v * error.angular
 
     monkeypatch.setattr(law, "velocity_reference", unlimited)
-    monkeypatch.setattr(law, "tip_row", lambda *a: (np.zeros(7), np.inf))
+    monkeypatch.setattr(law, "tip_bound", lambda *a: np.inf)
     assert not within_the_speed_limit()
 
 

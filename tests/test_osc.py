@@ -102,11 +102,13 @@ def test_following_the_approach_speed_never_brakes_harder_than_a_max(a_max, v_ma
         previous, d = v, d - v * h
 
 
-def reference(e, v_ref, qd_max, dt=1e-3, qd_free=np.zeros(7)):  # noqa: B008 - read only
+def reference(e, v_ref, qd_max, dt=1e-3, qd=np.zeros(7)):  # noqa: B008 - read only
     Jbar = np.zeros((7, 6))
     Jbar[0, 0] = 2.0
-    zero = np.zeros(3)
-    return osc.velocity_reference(e, zero, v_ref, zero, Jbar, qd_free, qd_max, 7.07, 0.5, 5.0, 1.5, 15.0, 0.8, dt)[0]
+    zero, out = np.zeros(3), osc.Twist(np.empty(3), np.empty(3))
+    still = osc.Twist(zero, zero)
+    osc.velocity_reference(osc.Twist(e, zero), osc.Twist(v_ref, zero), still, Jbar, qd, qd_max, P, dt, out)
+    return out.linear
 
 
 def test_a_goal_that_jumps_does_not_make_the_reference_jump():
@@ -136,10 +138,9 @@ def test_the_motion_torque_accelerates_the_tip_as_asked():
     qd, Jdqd = RNG.normal(size=7), RNG.normal(size=6)
     xd, omega, v, w = J[:3] @ qd, J[3:] @ qd, RNG.normal(size=3), RNG.normal(size=3)
     q, rest = RNG.normal(size=7), RNG.normal(size=7)
-    F, *parts = osc.motion_torque(
-        J, Jdqd, space.Lambda, space.NT, A, xd, omega, v, w, q, qd, rest, P.k_v, P.k_q, P.d_q, P.qdd_posture
-    )
-    qdd = A_inv @ sum(parts)
+    at, F, parts = osc.TaskDynamics(J, Jdqd, A, space.Lambda, space.NT), np.empty(6), np.empty((4, 7))
+    osc.motion_torque(at, osc.Twist(xd, omega), osc.Twist(v, w), q, qd, rest, P, F, parts)
+    qdd = A_inv @ parts.sum(axis=0)
     np.testing.assert_allclose(J @ qdd + Jdqd, F, atol=1e-8)
     np.testing.assert_allclose(F, P.k_v * (np.concatenate((v, w)) - np.concatenate((xd, omega))), rtol=1e-12)
 
@@ -150,9 +151,9 @@ def test_damping_parts_only_take_energy_out():
     zero3, zero6, zero7 = np.zeros(3), np.zeros(6), np.zeros(7)
     for _ in range(20):
         qd = RNG.normal(size=7)
-        _, _, brake, _, damp = osc.motion_torque(
-            J, zero6, space.Lambda, space.NT, A, J[:3] @ qd, J[3:] @ qd, zero3, zero3, zero7, qd, zero7,
-            P.k_v, P.k_q, P.d_q, P.qdd_posture,
-        )  # fmt: skip
+        at, parts = osc.TaskDynamics(J, zero6, A, space.Lambda, space.NT), np.empty((4, 7))
+        moving, still = osc.Twist(J[:3] @ qd, J[3:] @ qd), osc.Twist(zero3, zero3)
+        osc.motion_torque(at, moving, still, zero7, qd, zero7, P, np.empty(6), parts)
+        brake, damp = parts[osc.TASK_BRAKE], parts[osc.POSTURE_DAMPER]
         assert brake @ qd <= 1e-9
         assert damp @ qd <= 1e-6 * np.abs(damp).max()

@@ -23,15 +23,14 @@ import numpy as np
 
 from rtctl.app.arm_link import first_feedback
 from rtctl.arm import pipe
-from rtctl.arm.law import evaluate_law
 from rtctl.arm.osc import operational_space
 from rtctl.arm.pipe import initial, tick, warm
 from rtctl.arm.robot import Robot
 from rtctl.hal import clock
 from rtctl.hal.can.link import LinkSpec
 from rtctl.types import I64
-from tools import bench_log, bench_turn
-from tools.bench_rig import Arm, BoundFloor, Case, Floor, case, request, robot_and_spec
+from tools import bench_law, bench_log, bench_turn
+from tools.bench_rig import Arm, Floor, request, robot_and_spec
 from tools.bench_rows import Row, row, timed
 
 # The parts of the tick: function of rtctl.arm.pipe -> name of the row; all but the first two run when they must.
@@ -60,38 +59,6 @@ def machine() -> dict[str, Any]:
         "numba": numba.__version__,
         "numpy": np.__version__,
     }
-
-
-def difference(floor: BoundFloor, one: Case) -> float:
-    """Return by how much [Nm, m/s2] the floor's F*, torque of the field and whole torque differ from the law's."""
-    law, n = evaluate_law(*one.arguments), one.robot.n
-    floor.run(1)
-    F, field, whole = np.split(floor.out, [6, 6 + n])
-    parts = (F - law.F, field - one.robot.scratch.tau, whole - law.drive - law.keep)
-    return max(float(np.abs(part).max()) for part in parts)
-
-
-def laws(robot: Robot, floor: Floor | None, why: str, count: int) -> Iterator[Row]:
-    """The law, called from Python, against the C++ floor, timed in its own loop: blocks of both by turns."""
-    for m in (16, 64):
-        for slots in (1, 16, 64):
-            one = case(robot, m, slots)
-            name = f"law {m} PSP x {slots} obstacles"
-            evaluate_law(*one.arguments)
-            if floor is None:
-                yield row("law", name, timed(lambda a=one.arguments: evaluate_law(*a), count), note=f"no floor: {why}")  # type: ignore[misc]
-                continue
-            rival = floor.bind(one)
-            wrong = difference(rival, one)
-            ours, theirs = [], []
-            block = max(1, min(50, count // 4))
-            for _ in range(count // block):
-                ours.append(timed(lambda a=one.arguments: evaluate_law(*a), block))  # type: ignore[misc]
-                theirs.append(rival.run(block))
-            mine, its = np.concatenate(ours), np.concatenate(theirs)
-            ratio = float(np.median(mine) / np.median(its))
-            yield row("law", name, mine, ratio=ratio, rival="C++ floor", note=f"largest difference {wrong:.1e} Nm")
-            yield row("law", f"floor {m} x {slots}", its)
 
 
 @contextmanager
@@ -182,7 +149,7 @@ class Bench(NamedTuple):
 
 PARTS: dict[str, Callable[[Bench], Iterator[Row]]] = {
     "gc": lambda b: collections(),
-    "law": lambda b: laws(b.robot, b.floor, b.why, b.counts["law"]),
+    "law": lambda b: bench_law.laws(b.robot, b.floor, b.why, b.counts["law"]),
     "tick": lambda b: ticks(b.robot, b.counts["tick"]),
     "turn": lambda b: bench_turn.turns(b.robot, b.spec, b.counts["tick"]),
     "ring": lambda b: bench_turn.puts(b.robot, b.counts["call"]),

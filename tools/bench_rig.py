@@ -14,13 +14,13 @@ import numpy as np
 
 from rtctl import design as cfg
 from rtctl.app.arm_link import link_spec
-from rtctl.arm import guards, osc
+from rtctl.arm import bounds, least_change, nearby, osc, scaling
+from rtctl.arm.law import Motion, prepared
 from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model
-from rtctl.arm.osc import operational_space
+from rtctl.arm.osc import OperationalSpace, Twist, operational_space
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
-from rtctl.control.firas import field_buffers
 from rtctl.hal.can.link import LinkSpec
 from rtctl.hal.can.transport import Seqpacket
 from rtctl.protocol import e2e, frame, mit
@@ -164,12 +164,13 @@ class Null:
 
 
 class Case(NamedTuple):
-    """One size of the law: its arguments, and those of the floor."""
+    """One size of the law: the arguments of `evaluate_law`, and so those of the floor."""
 
     robot: Robot
     model: Model
+    space: OperationalSpace
     obstacles: Obstacles
-    arguments: tuple[Any, ...]
+    motion: Motion
 
 
 def case(robot: Robot, m: int, slots: int) -> Case:
@@ -195,16 +196,16 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         away *= (points.radius[j] + 0.05 + rng.uniform(0.3, 0.9) * robot.avoid.rho0) / np.sqrt((away**2).sum())
         ball = shape(f"ball{k}", "sphere", (0.05,), model.P[j] + away, 0.1 * rng.normal(size=3))
         obstacles = with_shape(obstacles, k, ball)
-    small = robot._replace(points=points, slots=slots, scratch=field_buffers(slots, m, robot.n))
+    small = prepared(robot._replace(points=points, slots=slots))
     space = operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), robot.motion)
     twist = model.J @ qd
     e, e_rot = np.array([0.1, 0.2, -0.05]), np.array([0.1, 0.0, 0.2])
     v_ref, w_ref = np.array([0.05, 0.05, 0.0]), np.array([0.1, 0.0, 0.1])
-    arguments = (
-        small, model, space, obstacles, q + 0.002, qd, twist[:3].copy(), twist[3:].copy(), e, e_rot, v_ref, w_ref,
-        robot.q_rest, 1.0,
+    motion = Motion(
+        q + 0.002, qd, Twist(twist[:3].copy(), twist[3:].copy()), Twist(e, e_rot), Twist(v_ref, w_ref), robot.q_rest,
+        1.0, np.zeros(robot.n),
     )  # fmt: skip
-    return Case(small, model, obstacles, arguments)
+    return Case(small, model, space, obstacles, motion)
 
 
 def _spread(total: int, count: int) -> I64:
@@ -252,22 +253,24 @@ class BoundFloor:
 
     def __init__(self, library: ctypes.CDLL, case: Case) -> None:
         self._library = library
-        r, model, space, obstacles, q, qd, xd, omega, e, e_rot, v_ref, w_ref, q_rest, _ = case.arguments
+        r, model, space, obstacles, motion = case
+        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd = motion
         p, a, b = r.motion, r.avoid, r.limit
         self._arrays = [
             np.ascontiguousarray(each, np.float64)
             for each in (
                 q, qd, model.q, model.A, model.A_inv, model.h, model.g, model.J, model.Jdqd, space.Lambda, space.Jbar,
-                space.NT, model.P, model.Jp, model.B, r.points.radius, xd, omega, e, e_rot, v_ref, w_ref, q_rest,
+                space.NT, model.P, model.Jp, model.B, r.points.radius, xd, omega, e, e_rot, v_ref, w_ref, q_rest, qdd,
                 r.q_min, r.q_max, r.qd_max, r.tau_max, r.tau_rate, r.braking, p.qdd_posture, b.rho0, b.rho_min,
                 b.rho_num, b.eta, b.k_d, obstacles.p, obstacles.v, obstacles.dims[:, 0],
             )
         ]  # fmt: skip
         self._scalars = np.array([
             p.k_p, p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max, p.speed_margin, p.k_q, p.d_q, a.rho0, a.rho_min,
-            a.rho_num, a.eta, a.k_d, a.look_ahead, a.v_smooth, a.m_max, r.dt, guards.SPEED_BAND,
-            guards.SPEED_HORIZON, guards.LEAST_SHARE, osc.SPEED_FLOOR, guards.JERK_SHARE, guards.TIP_SLOW, guards.NEAR,
-            guards.ABREAST, guards.ENOUGH, guards.STEPS, guards.PAIRS, guards.SOFT,
+            a.rho_num, a.eta, a.k_d, a.look_ahead, a.v_smooth, a.m_max, r.dt, bounds.SPEED_BAND,
+            bounds.SPEED_HORIZON, scaling.SHARE_MIN, osc.SPEED_FLOOR, bounds.JERK_SHARE, bounds.TIP_SLOW,
+            nearby.APPROACH_ZONE, nearby.LINK_BAND, least_change.STEPS_MAX, least_change.ROWS_MAX,
+            least_change.SOFTNESS, least_change.TURNED,
         ])  # fmt: skip
         self._link = r.points.link
         self._pointers = (ctypes.c_void_p * len(self._arrays))(*(each.ctypes.data for each in self._arrays))

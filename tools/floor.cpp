@@ -1,7 +1,8 @@
 // The floor that the servo's speed is measured against: the arithmetic of the law once more, as C++ would do it.
 //
-// Structure of arrays, obstacle-outer and point-inner loops, no allocation, no checks; spheres only. Beside it a bare
-// wake-up loop. Compiled and loaded by tools/bench.py, which also compares what it computes with what the law does.
+// Structure of arrays, obstacle-outer and point-inner loops, no allocation, no checks; spheres only. The guards are found
+// by the same algorithm: rows only for what is passed, Newton on the penalised program, the last answer as its start.
+// Beside it a bare wake-up loop. Compiled and loaded by tools/bench.py, which also compares what it computes with what the law does.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -11,18 +12,23 @@ namespace {
 
 // Order of the pointers and scalars that bench.py passes.
 enum { Q, QD, Q_EVAL, A, A_INV, H, G, J, JDQD, LAMBDA, JBAR, NT, P, JP, B, RADIUS, XD, OMEGA, E, E_ROT, V_REF, W_REF,
-       Q_REST, Q_MIN, Q_MAX, QD_MAX, TAU_MAX, TAU_RATE, BRAKING, QDD_POSTURE, L_RHO0, L_MIN, L_NUM, L_ETA, L_KD, CENTRE, SPEED,
-       BALL };
+       Q_REST, QDD, Q_MIN, Q_MAX, QD_MAX, TAU_MAX, TAU_RATE, BRAKING, QDD_POSTURE, L_RHO0, L_MIN, L_NUM, L_ETA, L_KD, CENTRE,
+       SPEED, BALL };
 enum { KP, KV, V_MAX, A_MAX, W_MAX, ALPHA_MAX, MARGIN, KQ, DQ, RHO0, RHO_MIN, RHO_NUM, ETA, KD, LOOK, SOFT, M_MAX, DT,
-       BAND, HORIZON, SHARE, SLOWEST, JERK, TIP_SLOW, NEAR, ABREAST, ENOUGH, STEPS, PAIRS,
-       YIELD };
+       BAND, HORIZON, SHARE, SLOWEST, JERK, TIP_SLOW, ZONE, BAND_LINK, STEPS, ROWS,
+       YIELD, TURNED };
 
-constexpr int N = 16, M = 128, K = 128;  // room
+constexpr int N = 16, M = 128, K = 256;  // room
 double X[3][M], V[3][M], BB[6][M], F[3][M], rho[K][M], nx[K][M], ny[K][M], nz[K][M], acc[K][M], push[K][M];
 double share[K][N + 1], least[K], force[K][3];
 bool close[K];
-constexpr int C = 2 * N + 129;  // bounds of the guards
-double bound_rows[C][N], bounds[C], towards_row[C][N], size[C];
+int near_list[K][M], near_count[K];
+constexpr int R = 512, CANDIDATES = 2048;
+struct Candidate { int k, j, state; double most; } cand[CANDIDATES];  // state: 0 cheap bound, 1 exact, 2 row made
+double accel[3][M], steep[M];                                         // of the candidates' points
+double rows[R][N], bound[R], stiff[R], over[2][R], high[N], low[N], tip_row[N], tip_most;
+bool made[2 * N + 1];
+int row_count, cand_count;
 
 int64_t now() {
     timespec t;
@@ -105,79 +111,177 @@ double jerk_along(const double *row, double mobility, const double *rate, int n,
     return s[JERK] * mobility / slowest;
 }
 
-void shares(const int *active, int k, int fresh, int n, double soft, double *r) {
-    static double L[C][C];
-    for (int i = 0; i < k; i++) {
-        for (int j = 0; j <= i; j++) {
-            double v = dot(bound_rows[active[i]], towards_row[active[j]], n);
-            if (i == j) v += soft * size[active[i]] * size[active[i]];
-            for (int l = 0; l < j; l++) v -= L[i][l] * L[j][l];
-            L[i][j] = i == j ? std::sqrt(v) : v / L[j][j];
+double mobility(const double *A_inv, const double *row, int n) {
+    double s = 0;
+    for (int i = 0; i < n; i++) s += row[i] * dot(A_inv + i * n, row, n);
+    return s;
+}
+
+void add_row(double most, double along, double x[2][N], int n, const double *s) {
+    int r = row_count++;
+    bound[r] = most, stiff[r] = 1 / (s[YIELD] * std::max(along, 1e-12));
+    for (int side = 0; side < 2; side++) over[side][r] = dot(rows[r], x[side], n) - most;
+}
+
+void accelerate(const double *const *a, const double *x, int n, int m) {
+    for (int j = 0; j < m; j++)
+        if (steep[j] >= 0)
+            for (int i = 0; i < 3; i++) accel[i][j] = dot(a[JP] + (3 * j + i) * n, x, n);
+}
+
+double closing(const Candidate &c) {
+    return -(nx[c.k][c.j] * accel[0][c.j] + ny[c.k][c.j] * accel[1][c.j] + nz[c.k][c.j] * accel[2][c.j]);
+}
+
+// Adds the rows that x[side] passes and that are not at hand.
+void collect(const double *const *a, const double *s, int n, int m, double x[2][N], int side) {
+    for (int i = 0; i < 2 * n; i++) {
+        double past = i < n ? x[side][i] - high[i] : low[i - n] - x[side][i - n];
+        if (past > 0 && !made[i] && row_count < R) {
+            for (int k = 0; k < n; k++) rows[row_count][k] = 0;
+            rows[row_count][i % n] = i < n ? 1 : -1;
+            add_row(i < n ? high[i] : -low[i - n], a[A_INV][(i % n) * (n + 1)], x, n, s), made[i] = true;
         }
-        double v = dot(bound_rows[active[i]], towards_row[fresh], n);
-        for (int l = 0; l < i; l++) v -= L[i][l] * r[l];
-        r[i] = v / L[i][i];
     }
-    for (int i = k - 1; i >= 0; i--) {
-        double v = r[i];
-        for (int l = i + 1; l < k; l++) v -= L[l][i] * r[l];
-        r[i] = v / L[i][i];
+    if (tip_most < INFINITY && !made[2 * n] && row_count < R && dot(tip_row, x[side], n) > tip_most) {
+        for (int k = 0; k < n; k++) rows[row_count][k] = tip_row[k];
+        add_row(tip_most, mobility(a[A_INV], tip_row, n), x, n, s), made[2 * n] = true;
+    }
+    if (cand_count) accelerate(a, x[side], n, m);
+    for (int i = 0; i < cand_count; i++) {
+        Candidate &c = cand[i];
+        if (c.state == 2 || !(closing(c) > c.most) || row_count == R) continue;
+        double *row = rows[row_count];
+        const double *px = a[JP] + 3 * c.j * n, *py = px + n, *pz = py + n;
+        for (int k = 0; k < n; k++) row[k] = -nx[c.k][c.j] * px[k] - ny[c.k][c.j] * py[k] - nz[c.k][c.j] * pz[k];
+        double along = mobility(a[A_INV], row, n);
+        if (c.state == 0) {
+            double jerk = jerk_along(row, along, a[TAU_RATE], n, s);
+            c.most = may_towards(rho[c.k][c.j], dot(row, a[QD], n), INFINITY, s[A_MAX], jerk, s), c.state = 1;
+        }
+        if (closing(c) > c.most) add_row(c.most, along, x, n, s), c.state = 2;
     }
 }
 
-// The accelerations x, moved as little as may be (in A's norm) to keep the first `count` bounds.
-void least_change(const double *A_inv, int count, int n, const double *s, double *x) {
-    int active[C], k = 0, fresh = -1;
-    bool held[C] = {};
-    double mult[C], r[C], z[N], pull = 0;
-    for (int c = 0; c < count; c++) {
-        for (int i = 0; i < n; i++) towards_row[c][i] = dot(A_inv + i * n, bound_rows[c], n);
-        size[c] = std::sqrt(std::max(dot(bound_rows[c], towards_row[c], n), 1e-12));
-    }
-    for (int turn = 0; turn < int(s[STEPS]); turn++) {
-        if (fresh < 0) {
-            double worst = s[ENOUGH];
-            for (int c = 0; c < count; c++) {
-                double over = held[c] ? 0 : (dot(bound_rows[c], x, n) - bounds[c]) / size[c];
-                if (over > worst) worst = over, fresh = c, pull = 0;
-            }
-            if (fresh < 0) break;
-        }
-        shares(active, k, fresh, n, s[YIELD], r);
-        for (int i = 0; i < n; i++) z[i] = towards_row[fresh][i];
-        for (int a = 0; a < k; a++)
-            for (int i = 0; i < n; i++) z[i] -= r[a] * towards_row[active[a]][i];
-        double give = s[YIELD] * size[fresh] * size[fresh];
-        double step = dot(bound_rows[fresh], x, n) - bounds[fresh] - give * pull;
-        step /= dot(bound_rows[fresh], z, n) + give;
-        int drop = -1;
-        for (int a = 0; a < k; a++)
-            if (mult[a] < step * r[a]) step = mult[a] / r[a], drop = a;
-        for (int i = 0; i < n; i++) x[i] -= step * z[i];
-        pull += step;
-        for (int a = 0; a < k; a++) mult[a] -= step * r[a];
-        if (drop < 0) {
-            active[k] = fresh, mult[k] = pull, held[fresh] = true, k++, fresh = -1;
-        } else {
-            held[active[drop]] = false;
-            for (int a = drop; a < k - 1; a++) active[a] = active[a + 1], mult[a] = mult[a + 1];
-            k--;
-        }
-    }
+bool passed(const double *const *a, const double *x, int n, int m) {
+    for (int i = 0; i < n; i++)
+        if (x[i] > high[i] || x[i] < low[i]) return true;
+    if (tip_most < INFINITY && dot(tip_row, x, n) > tip_most) return true;
+    if (cand_count) accelerate(a, x, n, m);
+    for (int i = 0; i < cand_count; i++)
+        if (closing(cand[i]) > cand[i].most) return true;
+    return false;
 }
 
-// Adds to tau what keeps the first `count` bounds; those of the joints come first and hold in any case.
-void guard(const double *A, const double *A_inv, int count, int n, const double *s, double *tau) {
-    double wanted[N], x[N];
-    bool acts = false;
-    mv(A_inv, tau, n, n, wanted);
-    for (int c = 0; c < count; c++) acts |= dot(bound_rows[c], wanted, n) > bounds[c];
-    if (!acts) return;
-    for (int i = 0; i < n; i++) x[i] = wanted[i];
-    least_change(A_inv, count, n, s, x);
-    for (int i = 0; i < n; i++) x[i] = std::min(std::max(x[i], -bounds[n + i]), bounds[i]) - wanted[i];
-    mv(A, x, n, n, wanted);
-    for (int i = 0; i < n; i++) tau[i] += wanted[i];
+void newton_step(const double *A_, const double *wanted, int n, const double *x, double *to) {
+    double H[N][N];
+    for (int i = 0; i < n; i++) {
+        to[i] = 0;
+        for (int j = 0; j <= i; j++) H[i][j] = A_[i * n + j];
+    }
+    for (int r = 0; r < row_count; r++) {
+        if (!(over[0][r] > 0)) continue;
+        double pull = stiff[r] * (bound[r] - dot(rows[r], wanted, n));
+        for (int i = 0; i < n; i++) {
+            to[i] += pull * rows[r][i];
+            double k = stiff[r] * rows[r][i];
+            for (int j = 0; j <= i; j++) H[i][j] += k * rows[r][j];
+        }
+    }
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < i; j++) {
+            for (int l = 0; l < j; l++) H[i][j] -= H[i][l] * H[j][l];
+            H[i][j] *= H[j][j];
+        }
+        for (int l = 0; l < i; l++) H[i][i] -= H[i][l] * H[i][l], to[i] -= H[i][l] * to[l];
+        H[i][i] = 1 / std::sqrt(H[i][i]);
+        to[i] *= H[i][i];
+    }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int l = i + 1; l < n; l++) to[i] -= H[l][i] * to[l];
+        to[i] *= H[i][i];
+    }
+    for (int i = 0; i < n; i++) to[i] += wanted[i];
+}
+
+double slope(double t, double linear, double quadratic, double &second) {
+    double first = linear + t * quadratic;
+    second = quadratic;
+    for (int r = 0; r < row_count; r++) {
+        double change = over[1][r] - over[0][r], past = over[0][r] + t * change;
+        if (past > 0) first += stiff[r] * past * change, second += stiff[r] * change * change;
+    }
+    return first;
+}
+
+void take_step(const double *A_, const double *wanted, int n, const double *s, double x[2][N]) {
+    double linear = 0, quadratic = 0, second;
+    for (int i = 0; i < n; i++) {
+        double p = 0, q = 0;
+        for (int k = 0; k < n; k++) p += A_[i * n + k] * (x[0][k] - wanted[k]), q += A_[i * n + k] * (x[1][k] - x[0][k]);
+        linear += (x[1][i] - x[0][i]) * p, quadratic += (x[1][i] - x[0][i]) * q;
+    }
+    double start = std::fabs(slope(0, linear, quadratic, second)), lo = 0, hi = 1, t = 1;
+    double first = slope(1, linear, quadratic, second);
+    if (first > s[TURNED] * start)
+        for (int i = 0; i < int(s[STEPS]); i++) {
+            (first > 0 ? hi : lo) = t;
+            t -= first / second;
+            if (!(lo < t && t < hi)) t = 0.5 * (lo + hi);
+            first = slope(t, linear, quadratic, second);
+            if (std::fabs(first) <= s[TURNED] * start) break;
+        }
+    for (int i = 0; i < n; i++) x[0][i] += t * (x[1][i] - x[0][i]);
+    for (int r = 0; r < row_count; r++) over[0][r] = dot(rows[r], x[0], n) - bound[r];
+}
+
+// Moves x[0] to what is nearest to `wanted` in A's norm and keeps the bounds.
+void nearest_kept(const double *const *a, const double *s, int n, int m, const double *wanted, double x[2][N]) {
+    for (int r = 0; r < row_count; r++) over[0][r] = dot(rows[r], x[0], n) - bound[r];
+    collect(a, s, n, m, x, 0);
+    for (int step = 0; step < int(s[STEPS]); step++) {
+        newton_step(a[A], wanted, n, x[0], x[1]);
+        for (int r = 0; r < row_count; r++) over[1][r] = dot(rows[r], x[1], n) - bound[r];
+        collect(a, s, n, m, x, 1);
+        bool settled = true;
+        for (int r = 0; r < row_count; r++) settled &= (over[0][r] > 0) == (over[1][r] > 0);
+        if (settled) {
+            for (int i = 0; i < n; i++) x[0][i] = x[1][i];
+            break;
+        }
+        take_step(a[A], wanted, n, s, x);
+    }
+    for (int i = 0; i < n; i++) x[0][i] = std::min(std::max(x[0][i], low[i]), high[i]);
+}
+
+// Changes tau (all but the load) into what keeps the bounds and what the motors have room for.
+void guarded(const double *const *a, const double *s, const double *load, int n, int m, double *tau) {
+    double wanted[N], less[N], x[2][N] = {}, d[N];
+    double f = fitting(tau, load, a[TAU_MAX], s[SHARE], n);
+    mv(a[A_INV], tau, n, n, wanted);
+    if (!passed(a, wanted, n, m)) {
+        for (int i = 0; i < n; i++) less[i] = f * tau[i];
+        if (f < 1) mv(a[A_INV], less, n, n, d);
+        if (f == 1 || !passed(a, d, n, m)) {
+            f = fitting(less, load, a[TAU_MAX], s[SHARE], n);
+            for (int i = 0; i < n; i++) tau[i] = f * less[i];
+            return;
+        }
+    }
+    row_count = 0;
+    for (int i = 0; i <= 2 * n; i++) made[i] = false;
+    for (int i = 0; i < n; i++) x[0][i] = a[QDD][i];
+    for (int attempt = 0; attempt < 2; attempt++) {
+        nearest_kept(a, s, n, m, wanted, x);
+        for (int i = 0; i < n; i++) d[i] = x[0][i] - wanted[i];
+        mv(a[A], d, n, n, less);
+        for (int i = 0; i < n; i++) less[i] += tau[i];
+        f = fitting(less, load, a[TAU_MAX], s[SHARE], n);
+        if (attempt == 1 || f == 1) break;
+        for (int i = 0; i < n; i++) tau[i] *= f;
+        mv(a[A_INV], tau, n, n, wanted);
+    }
+    for (int i = 0; i < n; i++) tau[i] = f * less[i];
 }
 
 void field(const double *const *a, const double *s, const int64_t *link, int n, int m, int slots, double *tau) {
@@ -207,21 +311,30 @@ void field(const double *const *a, const double *s, const int64_t *link, int n, 
         for (int j = 1; j < m; j++) low = rho[k][j] < low ? rho[k][j] : low;
         least[k] = low;
         force[k][0] = force[k][1] = force[k][2] = 0;
-        close[k] = low < rho0 + s[LOOK] * fastest;
+        const double cutoff = rho0 + s[LOOK] * fastest;
+        close[k] = low < cutoff;
         if (!close[k]) continue;
+        int count = 0;
+        for (int j = 0; j < m; j++) near_list[k][count] = j, count += rho[k][j] < cutoff;
+        near_count[k] = count;
         const double vx = w[3 * k], vy = w[3 * k + 1], vz = w[3 * k + 2];
-        for (int j = 0; j < m; j++) {
+        for (int l = 0; l <= n; l++) share[k][l] = 0;
+        for (int c = 0; c < count; c++) {
+            const int j = near_list[k][c];
             double x = nx[k][j], y = ny[k][j], z = nz[k][j], t = x * vx + y * vy + z * vz, f, d;
             double rdot = x * V[0][j] + y * V[1][j] + z * V[2][j] - t;
             double wide = t <= 0 ? 0 : t < soft ? 0.5 * t * t / soft : t - 0.5 * soft;
-            firas(rho[k][j], rdot, rho0 + s[LOOK] * wide, s[RHO_MIN], rho_num, s[ETA], s[KD], f, d);
+            double reach = rho0 + s[LOOK] * wide;
+            acc[k][j] = push[k][j] = 0;
+            if (rho[k][j] >= reach) continue;
+            firas(rho[k][j], rdot, reach, s[RHO_MIN], rho_num, s[ETA], s[KD], f, d);
             double b = x * x * BB[0][j] + y * y * BB[1][j] + z * z * BB[2][j] +
                        2 * (x * y * BB[3][j] + x * z * BB[4][j] + y * z * BB[5][j]);
             acc[k][j] = f, push[k][j] = (f + d) * (b <= floor_ ? b * s[M_MAX] * s[M_MAX] : 1 / b);
+            share[k][link[j]] += f;
         }
-        for (int l = 0; l <= n; l++) share[k][l] = 0;
-        for (int j = 0; j < m; j++) share[k][link[j]] += acc[k][j];
-        for (int j = 0; j < m; j++) {
+        for (int c = 0; c < count; c++) {
+            const int j = near_list[k][c];
             if (push[k][j] == 0) continue;
             double f = push[k][j] * acc[k][j] / share[k][link[j]], x = f * nx[k][j], y = f * ny[k][j], z = f * nz[k][j];
             F[0][j] += x, F[1][j] += y, F[2][j] += z, force[k][0] += x, force[k][1] += y, force[k][2] += z;
@@ -234,8 +347,8 @@ void field(const double *const *a, const double *s, const int64_t *link, int n, 
     }
 }
 
-// The bounds of the guards: joints upward, joints downward, the tip, what links approach. Returns how many.
-int gather(const double *const *a, const double *s, const int64_t *link, int n, int m, int slots) {
+// The bounds of the guards: joints, the tip, and cheap ones of the points that approach an obstacle.
+void gather(const double *const *a, const double *s, const int64_t *link, int n, int m, int slots) {
     for (int i = 0; i < n; i++) {
         double jerk = INFINITY;
         for (int k = 0; k < n; k++) {
@@ -243,42 +356,56 @@ int gather(const double *const *a, const double *s, const int64_t *link, int n, 
             if (x * jerk > s[JERK] * a[TAU_RATE][k]) jerk = s[JERK] * a[TAU_RATE][k] / x;
         }
         double top = s[BAND] * a[QD_MAX][i], q = a[Q][i], qd = a[QD][i], brake = a[BRAKING][i];
-        double high = may_towards(a[Q_MAX][i] - q, qd, top, brake, jerk, s);
-        double low = -may_towards(q - a[Q_MIN][i], -qd, top, brake, jerk, s);
-        if (low > 0) high = std::max(high, low);
-        else if (high < 0) low = std::min(low, high);
-        for (int k = 0; k < n; k++) bound_rows[i][k] = i == k, bound_rows[n + i][k] = i == k ? -1 : 0;
-        bounds[i] = high, bounds[n + i] = -low;
+        high[i] = may_towards(a[Q_MAX][i] - q, qd, top, brake, jerk, s);
+        low[i] = -may_towards(q - a[Q_MIN][i], -qd, top, brake, jerk, s);
+        if (low[i] > 0) high[i] = std::max(high[i], low[i]);
+        else if (high[i] < 0) low[i] = std::min(low[i], high[i]);
     }
-    int count = 2 * n;
-    double *row = bound_rows[count], tn[N], drift = 0;
     double speed = std::sqrt(dot(a[XD], a[XD], 3));
-    if (speed < s[TIP_SLOW] * s[V_MAX]) {
-        for (int i = 0; i < n; i++) row[i] = 0;
-        bounds[count++] = INFINITY;
-    } else {
-        tmv(a[J], a[XD], 3, n, row);
-        for (int i = 0; i < n; i++) row[i] /= speed;
-        drift = dot(a[JDQD], a[XD], 3) / speed;
-        mv(a[A_INV], row, n, n, tn);
-        bounds[count++] = may(s[V_MAX], speed, jerk_along(row, dot(row, tn, n), a[TAU_RATE], n, s), s) - drift;
+    tip_most = INFINITY;
+    if (!(speed < s[TIP_SLOW] * s[V_MAX])) {
+        tmv(a[J], a[XD], 3, n, tip_row);
+        for (int i = 0; i < n; i++) tip_row[i] /= speed;
+        double jerk = jerk_along(tip_row, mobility(a[A_INV], tip_row, n), a[TAU_RATE], n, s);
+        tip_most = may(s[V_MAX], speed, jerk, s) - dot(a[JDQD], a[XD], 3) / speed;
     }
-    for (int k = 0, pairs = 0; k < slots; k++)
-        for (int l = 0; close[k] && l <= n; l++) {
-            double low = s[NEAR] * s[RHO0] - s[ABREAST];
-            for (int j = 0; j < m; j++) low = link[j] == l && rho[k][j] < low ? rho[k][j] : low;
-            for (int j = 0; j < m; j++) {
-                if (link[j] != l || rho[k][j] >= low + s[ABREAST] || pairs == int(s[PAIRS])) continue;
-                const double *x = a[JP] + 3 * j * n, *y = x + n, *z = y + n;
-                row = bound_rows[count];
-                for (int i = 0; i < n; i++) row[i] = -nx[k][j] * x[i] - ny[k][j] * y[i] - nz[k][j] * z[i];
-                mv(a[A_INV], row, n, n, tn);
-                double jerk = jerk_along(row, dot(row, tn, n), a[TAU_RATE], n, s);
-                bounds[count++] = may_towards(rho[k][j], dot(row, a[QD], n), INFINITY, s[A_MAX], jerk, s);
-                pairs++;
-            }
+    const double zone = s[ZONE] * s[RHO0];
+    double best[N + 1];
+    cand_count = 0;
+    for (int k = 0; k < slots; k++) {
+        if (!close[k] || !(least[k] < zone)) continue;
+        int first = cand_count, end = first;
+        for (int i = 0; i < near_count[k]; i++) {
+            int j = near_list[k][i];
+            if (rho[k][j] < zone && end < CANDIDATES) cand[end++].j = j, best[link[j]] = zone - s[BAND_LINK];
         }
-    return count;
+        for (int c = first; c < end; c++) best[link[cand[c].j]] = std::min(best[link[cand[c].j]], rho[k][cand[c].j]);
+        for (int c = first; c < end; c++) {
+            int j = cand[c].j;
+            if (rho[k][j] < best[link[j]] + s[BAND_LINK]) cand[cand_count++] = {k, j, 0, 0};
+        }
+    }
+    if (!cand_count) return;
+    for (int j = 0; j < m; j++) steep[j] = -1;
+    for (int i = 0; i < cand_count; i++) {
+        Candidate &c = cand[i];
+        int j = c.j;
+        if (steep[j] < 0) {
+            double most = 0;
+            for (int k = 0; k < n; k++) {
+                const double *p = a[JP] + 3 * j * n + k;
+                most = std::max(most, (p[0] * p[0] + p[n] * p[n] + p[2 * n] * p[2 * n]) / (a[TAU_RATE][k] * a[TAU_RATE][k]));
+            }
+            steep[j] = std::max(std::sqrt(most), 1e-9);
+        }
+        double x = nx[c.k][j], y = ny[c.k][j], z = nz[c.k][j];
+        double b = x * x * BB[0][j] + y * y * BB[1][j] + z * z * BB[2][j] +
+                   2 * (x * y * BB[3][j] + x * z * BB[4][j] + y * z * BB[5][j]);
+        double jerk = (1 - 1e-9) * s[JERK] * std::max(b, 0.0) / steep[j];
+        double v = -(x * V[0][j] + y * V[1][j] + z * V[2][j]);
+        c.most = may_towards(rho[c.k][j], v, INFINITY, s[A_MAX], jerk, s);
+        c.most -= 1e-9 * (1 + std::fabs(c.most));
+    }
 }
 
 void law(const double *const *a, const double *s, const int64_t *link, int n, int m, int slots, double *out) {
@@ -332,16 +459,9 @@ void law(const double *const *a, const double *s, const int64_t *link, int n, in
             share_left = std::min(share_left, std::max(0.0, ((d > 0 ? top : -top) - kept) / d));
     }
     for (int i = 0; i < n; i++) sum[i] += share_left * tau_drive[i];
-    int count = gather(a, s, link, n, m, slots);
-    for (int i = 0; i < n; i++) tn[i] = sum[i];
-    guard(a[A], a[A_INV], count, n, s, tn);
-    f = fitting(tn, load, a[TAU_MAX], s[SHARE], n);
-    if (f < 1) {
-        for (int i = 0; i < n; i++) tn[i] = f * sum[i];
-        guard(a[A], a[A_INV], count, n, s, tn);
-    }
-    f = fitting(tn, load, a[TAU_MAX], s[SHARE], n);
-    for (int i = 0; i < n; i++) out[6 + n + i] = f * tn[i] + load[i];
+    gather(a, s, link, n, m, slots);
+    guarded(a, s, load, n, m, sum);
+    for (int i = 0; i < n; i++) out[6 + n + i] = sum[i] + load[i];
 }
 
 }  // namespace

@@ -135,19 +135,19 @@ MARGIN, AGE, RHO, GOAL_RHO = 12, 13, 14, 15
 
 
 @kernel
-def field_in(reals: F64, wholes: I64, n: int, m: int) -> Field:
-    """Return the work arrays of the field in two flat ones; see `field_sizes`."""
-    slots = wholes.shape[0] // 2
+def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
+    """Return the work arrays of the field at the head of two flat ones; see `field_sizes`."""
     a = n + 4 * slots
     b = a + 6 * slots * m
     c = b + 15 * m
     return Field(
         reals[:n], reals[n : n + slots], wholes[:slots], reals[n + slots : a].reshape(slots, 3),
         reals[a:b].reshape(slots, 6, m), reals[b:c].reshape(15, m),
-        reals[c : c + slots * (n + 1)].reshape(slots, n + 1), wholes[slots:],
+        reals[c : c + slots * (n + 1)].reshape(slots, n + 1), wholes[slots : 2 * slots],
+        wholes[3 * slots : (3 + m) * slots].reshape(slots, m), wholes[2 * slots : 3 * slots],
     )  # fmt: skip
 
 
 def field_sizes(slots: int, m: int, n: int) -> tuple[int, int]:
     """Return how many real and whole numbers the work arrays of K = `slots` obstacles, m points, n joints are."""
-    return n + slots * (5 + n + 6 * m) + 15 * m, 2 * slots
+    return n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)

@@ -1,311 +1,190 @@
 """Guards on the law's torque: nothing is driven to where it could not be held any more.
 
-They bound accelerations, qdd = A^-1 tau with tau all torque but gravity and Coriolis, as velocity dampers do
-(Faverjon): a speed v may not pass its bound v_b within SPEED_HORIZON, so vd <= (v_b - v)/T. Torque is slewed on its way
-out, so an acceleration can be taken back at a bounded jerk j only: while v < v_b also vd <= sqrt(2 j (v_b - v)).
-Bounded are every joint, by its speed and by what still stops it before its limit; the tip, by v_max; and every link
-near an obstacle or another link, by what still stops its own approach before they touch.
+They bound accelerations, qdd = A^-1 tau with tau all torque but gravity and Coriolis: of every joint, by its speed and
+by what still stops it before its limit; of the tip, by v_max; and of every link near an obstacle or another link, by
+what still stops its own approach before they touch (`bounds`, `nearby`).
 
 Where a bound is passed, the accelerations that come nearest in A's norm and keep all of them take the place of those
-wanted (Gauss: as if mechanical stops held the arm there). Cutting a joint's own acceleration alone would not do: what
-is left of a push away from an obstacle may then be a push towards it.
+wanted (Gauss: as if mechanical stops held the arm there; `least_change`). Cutting a joint's own acceleration alone
+would not do: what is left of a push away from an obstacle may then be a push towards it. The search goes on until no
+bound is passed, so its answer is that of all rows, though few are made.
 """
 
-import numpy as np
+import math
+from typing import NamedTuple
 
-from rtctl.kernel import kernel
-from rtctl.kernel.linalg import matvec
+from rtctl.arm import least_change
+from rtctl.arm.bounds import Bounds, approach_bound, jerk_along
+from rtctl.arm.field import NORMAL, RHO
+from rtctl.arm.least_change import COUNT, ROWS_MAX, STEPS, STEPS_MAX, Rows, add_row, dot, mobility
+from rtctl.arm.nearby import CHEAP, EXACT, MADE, Nearby, accelerate, towards
+from rtctl.arm.scaling import scale_to_limits
+from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
 
-SPEED_BAND = 0.9  # fraction of qd_max that the guard lets joints have
-LEAST_SHARE = 0.2  # of tau_max that the law may use however heavy the arm
-SPEED_HORIZON = 0.02  # [s] within which it wants a bound kept: ten times what two periods of delay at 1 kHz bear
-JERK_SHARE = 0.5  # of the torque rate counted on: the joints slew as one, the others want their part
-TIP_SLOW = 0.1  # of v_max, below which the tip needs no guard
-NEAR = 0.5  # of the influence, within which a link's approach is guarded; farther out v_max can be given up
-ABREAST = 0.02  # [m]
-OWN_FREE = 0.15  # of v_max, at which a link may come near another of the same arm
-STEPS = 60  # of the search for the least change at most
-SOFT = 1e-4  # by which a bound yields, of the motion its own multiplier makes
-ENOUGH = 1e-6  # [sqrt(W)] that a bound may be passed by, as acceleration times the root of the mass along it
-PAIRS = 64  # links near obstacles or links that are guarded at a time
+
+class Inertia(NamedTuple):
+    """The joint-space kinetic energy matrix."""
+
+    A: F64  # (n, n) [kg m2 or kg]
+    A_inv: F64  # (n, n)
 
 
-@kernel
-def may(bound: float, speed: float, jerk: float) -> float:
-    """Return the largest acceleration with which `speed` can still be kept below `bound`."""
-    gap = bound - speed
-    accel: float = gap / SPEED_HORIZON
-    if gap > 0.0:
-        accel = min(accel, np.sqrt(2.0 * jerk * gap))
-    return accel
+class Motors(NamedTuple):
+    """What the motors can give."""
+
+    load: F64  # (n,) [Nm] that carries the arm
+    tau_max: F64  # (n,) [Nm] that may be sent
 
 
-@kernel
-def may_towards(room: float, speed: float, top: float, braking: float, jerk: float) -> float:
-    """Return the largest acceleration towards a limit `room` ahead, at `speed` towards it.
+@leaf_kernel
+def passed(x: F64, bounds: Bounds, near: Nearby) -> bool:
+    """Return whether accelerations x (n,) pass any bound, the cheap ones of candidates included."""
+    for i in range(x.shape[0]):
+        if x[i] > bounds.high[i] or x[i] < bounds.low[i]:
+            return True
+    for r in range(bounds.most.shape[0]):
+        if bounds.most[r] < math.inf and dot(bounds.rows, r, x) > bounds.most[r]:
+            return True
+    if near.size > 0:
+        accelerate(x, near)
+    for c in range(near.size):
+        if towards(c, near) > near.found.most[c]:
+            return True
+    return False
 
-    The bound is min(top, sqrt(2 braking room')), which a joint that brakes follows down to rest; its own slope,
-    -braking speed/bound, is fed forward. room' ends where a damper of SPEED_HORIZON still stops short of the limit.
+
+@leaf_kernel
+def _make_candidate(s: Rows, c: int, near: Nearby, A_inv: F64) -> None:
+    """Write the row of a candidate, -n^T Jp, behind the last one and make its bound exact; count the row if passed.
+
+    Passed by the accelerations that `accelerate` left.
     """
-    left = max(0.0, room - 2.0 * SPEED_HORIZON * SPEED_HORIZON * braking)
-    curve = np.sqrt(2.0 * braking * left)
-    if curve >= top:
-        return may(top, speed, jerk)
-    slope = braking * min(1.0, max(0.0, speed) / max(curve, SPEED_HORIZON * braking))
-    accel: float = may(curve, speed, jerk) - slope
-    return accel
-
-
-@kernel
-def joint_bounds(
-    A: F64, q: F64, qd: F64, q_min: F64, q_max: F64, qd_max: F64, braking: F64, tau_rate: F64
-) -> tuple[F64, F64]:
-    """Return the least and largest accelerations (n,) with which every joint can still stop before its limit.
-
-    braking (n,) [rad/s2]; the jerk of joint i is what the torque rates allow it alone, min over k of rate_k/|A_ki|.
-    """
-    n = qd.shape[0]
-    low, high = np.empty(n), np.empty(n)
+    n, r, found = A_inv.shape[0], s.numbers[COUNT], near.found
+    k, j = found.place[0, c], found.place[1, c]
     for i in range(n):
-        jerk = np.inf
-        for k in range(n):
-            if abs(A[k, i]) * jerk > JERK_SHARE * tau_rate[k]:
-                jerk = JERK_SHARE * tau_rate[k] / abs(A[k, i])
-        top = SPEED_BAND * qd_max[i]
-        high[i] = may_towards(q_max[i] - q[i], qd[i], top, braking[i], jerk)
-        low[i] = -may_towards(q[i] - q_min[i], -qd[i], top, braking[i], jerk)
-        if low[i] > 0.0:  # it must brake, and is not asked to do so gently
-            high[i] = max(high[i], low[i])
-        elif high[i] < 0.0:
-            low[i] = min(low[i], high[i])
-    return low, high
+        t = 0.0
+        for d in range(3):
+            t -= near.seen.pairs[k, NORMAL + d, j] * near.points.Jp[j, d, i]
+        s.C[r, i] = t
+    along = mobility(A_inv, s.C, r)
+    if found.place[2, c] == CHEAP:
+        jerk, speed = jerk_along(s.C, r, along, near.tau_rate), dot(s.C, r, near.qd)
+        found.most[c] = approach_bound(near.seen.pairs[k, RHO, j], speed, math.inf, near.braking, jerk)
+        found.place[2, c] = EXACT
+    if towards(c, near) > found.most[c]:
+        add_row(s, found.most[c], along)
+        found.place[2, c] = MADE
 
 
-@kernel
-def jerk_along(row: F64, mobility: float, tau_rate: F64) -> float:
-    """Return the jerk along a row (n,) that a force of the torque rates gives, mobility = row A^-1 row^T [1/kg]."""
-    slowest = 1e-9
-    for i in range(row.shape[0]):
-        slowest = max(slowest, abs(row[i]) / tau_rate[i])
-    return JERK_SHARE * mobility / slowest
-
-
-@kernel
-def tip_row(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64) -> tuple[F64, float]:
-    """Return the row (n,) along the tip's velocity xd (3,) and the bound of row qdd that keeps |xd| below v_max [m/s].
-
-    The motion task never asks for more than v_max; a field that shoves the arm may. inf while the tip is slow.
-    """
-    speed = np.sqrt(xd[0] * xd[0] + xd[1] * xd[1] + xd[2] * xd[2])
-    if speed < TIP_SLOW * v_max:
-        return np.zeros(J.shape[1]), np.inf
-    row = (J[0] * xd[0] + J[1] * xd[1] + J[2] * xd[2]) / speed
-    drift = (Jdqd[0] * xd[0] + Jdqd[1] * xd[1] + Jdqd[2] * xd[2]) / speed
-    jerk = jerk_along(row, _dot(row, matvec(A_inv, row)), tau_rate)
-    return row, may(v_max, speed, jerk) - drift
-
-
-@kernel
-def approach_rows(
-    near: I64, link: I64, distances: F64, Jp: F64, own_rho: F64, own_row: F64, dq: F64, A_inv: F64, qd: F64,
-    rho0: float, own_stop: float, v_max: float, braking: float, tau_rate: F64,
-) -> tuple[F64, F64]:  # fmt: skip
-    """Return rows (r, n) along which links come nearer to what they must not touch, and bounds (r,) of row qdd.
-
-    near (K,): slots at hand are >= 0; link (m,); distances (K, >= 4, m): rho [m] and normal of every point, of which
-    the nearest of a link count and those within ABREAST of it: a link also turns; Jp (>= m, 3, n). own_rho (L,),
-    own_row (L, n), dq: as in `own_field`; every pair that is measured counts, and is slowed before own_stop [m] to what
-    its field turns easily, OWN_FREE of v_max [m/s]: that field is thin and steep, and torque that is slewed comes too
-    late for a link that enters it fast. Slower than that only touching is prevented: a guard as steep as the field
-    would set a folded arm swinging between two pairs. It is the arm's own approach -row qd alone that is bounded, as if
-    with braking [m/s2]; what comes towards it is for the field to flee.
-    """
-    n = qd.shape[0]
-    rows, rooms = np.empty((PAIRS, n)), np.empty(PAIRS)
-    count = 0
-    for k in range(near.shape[0]):
-        if near[k] < 0:
+@leaf_kernel
+def _collect(s: Rows, side: int, bounds: Bounds, made: I64, near: Nearby, A_inv: F64) -> None:
+    """Add the rows that x of that side passes and that are not at hand; made (2n + r,): 1 for those that are."""
+    x, n = s.x[side], A_inv.shape[0]
+    for i in range(2 * n):
+        over = x[i] - bounds.high[i] if i < n else bounds.low[i - n] - x[i - n]
+        if over > 0.0 and made[i] == 0 and s.numbers[COUNT] < ROWS_MAX:
+            for k in range(n):
+                s.C[s.numbers[COUNT], k] = 0.0
+            s.C[s.numbers[COUNT], i % n] = 1.0 if i < n else -1.0
+            add_row(s, bounds.high[i] if i < n else -bounds.low[i - n], A_inv[i % n, i % n])
+            made[i] = 1
+    for r in range(bounds.most.shape[0]):
+        if bounds.most[r] == math.inf or made[2 * n + r] != 0 or s.numbers[COUNT] == ROWS_MAX:
             continue
-        for l in range(n + 1):
-            least = NEAR * rho0 - ABREAST
-            for i in range(link.shape[0]):
-                if link[i] == l and distances[k, 0, i] < least:
-                    least = distances[k, 0, i]
-            for j in range(link.shape[0]):
-                if link[j] != l or distances[k, 0, j] >= least + ABREAST or count == PAIRS:
-                    continue
-                for i in range(n):
-                    rows[count, i] = 0.0
-                    for c in range(3):
-                        rows[count, i] -= distances[k, 1 + c, j] * Jp[j, c, i]
-                rooms[count] = distances[k, 0, j]
-                count += 1
-    obstacles = count
-    for s in range(own_rho.shape[0]):
-        if own_rho[s] < np.inf and count < PAIRS:
-            rows[count], rooms[count] = -own_row[s], own_rho[s] + _dot(own_row[s], dq)
-            count += 1
-    bounds = np.empty(count)
-    for r in range(count):
-        speed, jerk = _dot(rows[r], qd), jerk_along(rows[r], _dot(rows[r], matvec(A_inv, rows[r])), tau_rate)
-        if r < obstacles:
-            bounds[r] = may_towards(rooms[r], speed, np.inf, braking, jerk)
-        else:
-            fast = may_towards(rooms[r] - own_stop, speed, np.inf, braking, jerk)
-            bounds[r] = max(fast, may_towards(rooms[r], speed, OWN_FREE * v_max, braking, jerk))
-    return rows[:count], bounds
+        if dot(bounds.rows, r, x) > bounds.most[r]:
+            for k in range(n):
+                s.C[s.numbers[COUNT], k] = bounds.rows[r, k]
+            add_row(s, bounds.most[r], mobility(A_inv, bounds.rows, r))
+            made[2 * n + r] = 1
+    if near.size > 0:
+        accelerate(x, near)
+    for c in range(near.size):
+        if near.found.place[2, c] != MADE and towards(c, near) > near.found.most[c] and s.numbers[COUNT] < ROWS_MAX:
+            _make_candidate(s, c, near, A_inv)
 
 
-@kernel
-def _dot(a: F64, b: F64) -> float:
-    s = 0.0
-    for i in range(a.shape[0]):
-        s += a[i] * b[i]
-    return s
+@leaf_kernel
+def nearest_kept(s: Rows, inertia: Inertia, wanted: F64, bounds: Bounds, made: I64, near: Nearby) -> None:
+    """Move x[0] (n,), anything, to what is nearest to `wanted` (n,) in A's norm and keeps all bounds."""
+    s.numbers[STEPS] = 0
+    least_change.measure(s, 0)
+    _collect(s, 0, bounds, made, near, inertia.A_inv)
+    while s.numbers[STEPS] < STEPS_MAX:
+        s.numbers[STEPS] += 1
+        least_change.newton_step(s, inertia.A, wanted)
+        least_change.measure(s, 1)
+        _collect(s, 1, bounds, made, near, inertia.A_inv)
+        if least_change.settled(s):
+            for i in range(wanted.shape[0]):
+                s.x[0, i] = s.x[1, i]
+            break
+        least_change.take_step(s, inertia.A, wanted)
+    for i in range(wanted.shape[0]):
+        s.x[0, i] = min(max(s.x[0, i], bounds.low[i]), bounds.high[i])
 
 
-@kernel
-def guard(A: F64, A_inv: F64, tau: F64, low: F64, high: F64, rows: F64, bounds: F64) -> tuple[F64, bool]:
-    """Return the torque (n,) [Nm] whose addition keeps low <= qdd <= high and rows qdd <= bounds, and whether any acts.
+@leaf_kernel
+def _product(M: F64, v: F64, out: F64) -> None:
+    for i in range(v.shape[0]):
+        out[i] = dot(M, i, v)
 
-    Least change in A's norm: min (qdd - A^-1 tau)^T A (qdd - A^-1 tau). Where not all of them can be kept the joints'
-    bounds are, and the rows that came last are not.
+
+@leaf_kernel
+def let_pass(inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: Nearby, work: F64) -> bool:
+    """Return whether tau (n,) [Nm], all torque but the load, passes no bound; then work[0] is what may be sent of it.
+
+    work (2, n). What the motors lack is taken from all alike; less of it must pass no bound either.
     """
-    n = low.shape[0]
-    wanted = matvec(A_inv, tau)
-    acts = False
-    for i in range(n):
-        acts |= wanted[i] > high[i] or wanted[i] < low[i]
-    for r in range(rows.shape[0]):
-        acts |= _dot(rows[r], wanted) > bounds[r]
-    if not acts:
-        return np.zeros(n), False
-    C, b = np.zeros((2 * n + rows.shape[0], n)), np.empty(2 * n + rows.shape[0])
-    for i in range(n):
-        C[i, i], b[i], C[n + i, i], b[n + i] = 1.0, high[i], -1.0, -low[i]
-    C[2 * n :], b[2 * n :] = rows, bounds
-    qdd = least_change(A_inv, wanted, C, b)
-    for i in range(n):
-        qdd[i] = min(max(qdd[i], low[i]), high[i])
-    return matvec(A, qdd - wanted), True
-
-
-@kernel
-def least_change(A_inv: F64, wanted: F64, C: F64, b: F64) -> F64:
-    """Return the x (n,) nearest to `wanted` in the norm of A with C x <= b (Goldfarb and Idnani, dual active set).
-
-    From the unbounded best, the bound that is passed most becomes active; a multiplier that would turn negative on the
-    way gives its bound up. Every bound yields by SOFT of what its multiplier moves along it: bounds that contradict
-    each other, as obstacles from two sides may, find a compromise then, and those that say the same no singular matrix.
-    """
-    n, count = wanted.shape[0], b.shape[0]
-    x = wanted.copy()
-    M, size = np.empty((count, n)), np.empty(count)
-    for c in range(count):
-        M[c] = matvec(A_inv, C[c])
-        size[c] = np.sqrt(max(_dot(C[c], M[c]), 1e-12))
-    active, held, force = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count)
-    k, fresh, pull = 0, -1, 0.0  # active bounds; the one being added and its multiplier
-    for _ in range(STEPS):
-        if fresh < 0:
-            worst = ENOUGH
-            for c in range(count):
-                if held[c] == 0 and (_dot(C[c], x) - b[c]) / size[c] > worst:
-                    worst, fresh, pull = (_dot(C[c], x) - b[c]) / size[c], c, 0.0
-            if fresh < 0:
-                break
-        share = _shares(C, M, size, active, k, fresh)
-        z = M[fresh].copy()
-        for a in range(k):
-            z -= share[a] * M[active[a]]
-        give = SOFT * size[fresh] * size[fresh]
-        step, drop = (_dot(C[fresh], x) - b[fresh] - give * pull) / (_dot(C[fresh], z) + give), -1
-        for a in range(k):
-            if force[a] < step * share[a]:
-                step, drop = force[a] / share[a], a
-        x -= step * z
-        pull += step
-        for a in range(k):
-            force[a] -= step * share[a]
-        if drop < 0:
-            active[k], force[k], held[fresh] = fresh, pull, 1
-            k, fresh = k + 1, -1
-        else:
-            held[active[drop]] = 0
-            for a in range(drop, k - 1):
-                active[a], force[a] = active[a + 1], force[a + 1]
-            k -= 1
-    return x
-
-
-@kernel
-def _shares(C: F64, M: F64, size: F64, active: I64, k: int, fresh: int) -> F64:
-    """Return the solution (k,) of (N A^-1 N^T + soft) r = N A^-1 c, N the k active rows, c the fresh one (Cholesky)."""
-    L, r = np.empty((k, k)), np.empty(k)
-    for i in range(k):
-        for j in range(i + 1):
-            s = _dot(C[active[i]], M[active[j]])
-            if i == j:
-                s += SOFT * size[active[i]] * size[active[i]]
-            for l in range(j):
-                s -= L[i, l] * L[j, l]
-            L[i, j] = np.sqrt(s) if i == j else s / L[j, j]
-        s = _dot(C[active[i]], M[fresh])
-        for l in range(i):
-            s -= L[i, l] * r[l]
-        r[i] = s / L[i, i]
-    for i in range(k - 1, -1, -1):
-        s = r[i]
-        for l in range(i + 1, k):
-            s -= L[l, i] * r[l]
-        r[i] = s / L[i, i]
-    return r
-
-
-@kernel
-def guarded(
-    A: F64, A_inv: F64, tau: F64, load: F64, tau_max: F64, low: F64, high: F64, rows: F64, bounds: F64
-) -> tuple[F64, bool]:
-    """Return tau (n,) [Nm], all torque but the load (n,), as it may be sent, and whether any guard acted.
-
-    What the motors lack is taken from what was wanted first, so that braking keeps its strength.
-    """
-    added, acts = guard(A, A_inv, tau, low, high, rows, bounds)
-    share = fitting(tau + added, load, tau_max)
-    if share < 1.0:
-        tau = share * tau
-        added, more = guard(A, A_inv, tau, low, high, rows, bounds)
-        acts = acts or more
-    out = tau + added
-    return fitting(out, load, tau_max) * out, acts
-
-
-@kernel
-def fitting(tau: F64, load: F64, tau_max: F64) -> float:
-    """Return the share in (0, 1] of tau (n,) [Nm] that every joint has room for beside its load, at least LEAST_SHARE.
-
-    A torque that asks for more than the motors have must lose strength, not direction: clamped joint by joint it would
-    push somewhere else.
-    """
-    share = 1.0
+    _product(inertia.A_inv, tau, work[0])
+    if passed(work[0], bounds, near):
+        return False
+    share = scale_to_limits(tau, motors.load, motors.tau_max)
     for i in range(tau.shape[0]):
-        spare = tau_max[i] - load[i] if tau[i] > 0.0 else tau_max[i] + load[i]
-        room = max(min(spare, tau_max[i]), LEAST_SHARE * tau_max[i])
-        if abs(tau[i]) * share > room:
-            share = room / abs(tau[i])
-    return share
+        work[1, i] = share * tau[i]
+    if share < 1.0:
+        _product(inertia.A_inv, work[1], work[0])
+        if passed(work[0], bounds, near):
+            return False
+        share = scale_to_limits(work[1], motors.load, motors.tau_max)
+    for i in range(tau.shape[0]):
+        work[0, i] = share * work[1, i]
+    return True
 
 
-@kernel
-def yielding(drive: F64, keep: F64, tau_max: F64) -> float:
-    """Return the largest share in [0, 1] of drive (n,) [Nm] with which |keep + share drive| <= tau_max at every joint.
+@leaf_kernel
+def hold_back(
+    s: Rows, inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: Nearby, made: I64, work: F64
+) -> bool:  # fmt: skip
+    """Write what of tau (n,) [Nm] may be sent into work[0] (2, n), and return whether any guard acted.
 
-    keep (n,) [Nm], load included; a joint that keep alone takes beyond its bound leaves nothing that goes further.
+    Least change in A's norm: min (qdd - A^-1 tau)^T A (qdd - A^-1 tau) with low <= qdd <= high, rows qdd <= most, and
+    the same for every point near an obstacle. Where not all can be kept the joints' bounds are.
+    What the motors lack is taken from what was wanted first, so that braking keeps its strength.
+    The search begins at s.x[0] (n,) [rad/s2], accelerations near the answer as those of the tick before are: what they
+    pass it will pass. made (2n + r,): work.
     """
-    share = 1.0
-    for i in range(drive.shape[0]):
-        if drive[i] != 0.0 and abs(keep[i] + share * drive[i]) > tau_max[i]:
-            room = tau_max[i] - keep[i] if drive[i] > 0.0 else -tau_max[i] - keep[i]
-            share = min(share, max(0.0, room / drive[i]))
-    return share
+    n, acts, sent, wanted, share = tau.shape[0], False, s.sent, s.wanted, 1.0
+    s.numbers[COUNT] = 0
+    for r in range(made.shape[0]):
+        made[r] = 0
+    for i in range(n):
+        if not math.isfinite(s.x[0, i]):  # of a tick that was not a number; the next may be one again
+            s.x[0, i] = 0.0
+    for attempt in range(2):
+        for i in range(n):
+            sent[i] = share * tau[i]
+        _product(inertia.A_inv, sent, wanted)
+        nearest_kept(s, inertia, wanted, bounds, made, near)
+        for i in range(n):
+            acts |= s.x[0, i] != wanted[i]
+            wanted[i] = s.x[0, i] - wanted[i]
+        _product(inertia.A, wanted, work[0])
+        for i in range(n):
+            work[0, i] = sent[i] + work[0, i]
+        share = scale_to_limits(work[0], motors.load, motors.tau_max)
+        if attempt == 1 or share == 1.0:
+            break
+    for i in range(n):
+        work[0, i] *= share
+    return acts

@@ -1,25 +1,38 @@
 """The field of the arm on itself: links against links, and the joint limits (Khatib 1986)."""
 
+import math
+
 import numpy as np
 
 from rtctl.control.firas import CAPPED, CONTACT, FieldParams, LimitParams, firas
-from rtctl.kernel import kernel
+from rtctl.kernel import kernel, leaf_kernel
 from rtctl.types import F64
 
 
 @kernel
 def own_field(rho: F64, row: F64, dq: F64, qd: F64, A_inv: F64, params: FieldParams) -> tuple[F64, float, int]:
-    """Repulsion between the watched links of the arm, equal and opposite; returns tau, least distance, flags.
+    """Return (tau (n,) [Nm], least rho [m], flags) of `self_collision`, which it calls."""
+    tau = np.empty(qd.shape[0])
+    least, flags = self_collision(rho, row, dq, qd, A_inv, params, tau)
+    return tau, least, flags
+
+
+@leaf_kernel
+def self_collision(
+    rho: F64, row: F64, dq: F64, qd: F64, A_inv: F64, params: FieldParams, tau: F64
+) -> tuple[float, int]:
+    """Repulsion between links of the arm, equal and opposite; writes tau (n,) [Nm]; returns least distance, flags.
 
     tau = sum over pairs of lambda (a + d) row^T, lambda = 1/(row A^-1 row^T), on rho + row dq: a motion that both links
     share costs nothing. rho (L,) [m] and row = d rho/d q (L, n) of the last evaluation; dq (n,) [rad] since it;
-    qd (n,); A_inv (n, n). Returns tau (n,) [Nm], the least rho [m] (inf of none), flags CAPPED | CONTACT.
+    qd (n,); A_inv (n, n). Returns the least rho [m] (inf of none), flags CAPPED | CONTACT.
     """
     n = qd.shape[0]
-    tau = np.zeros(n)
-    least, flags = np.inf, 0
+    least, flags = math.inf, 0
+    for i in range(n):
+        tau[i] = 0.0
     for s in range(rho.shape[0]):
-        if rho[s] == np.inf:
+        if rho[s] == math.inf:
             continue
         r, rho_dot = rho[s], 0.0
         for i in range(n):
@@ -39,10 +52,10 @@ def own_field(rho: F64, row: F64, dq: F64, qd: F64, A_inv: F64, params: FieldPar
         f = (a + d) / max(mobility, 1.0 / params.m_max)
         for i in range(n):
             tau[i] += f * row[s, i]
-    return tau, least, flags
+    return least, flags
 
 
-@kernel
+@leaf_kernel
 def joint_limit_field(q: F64, qd: F64, q_min: F64, q_max: F64, A_diag: F64, params: LimitParams, tau: F64) -> int:
     """Repulsion from both limits of every joint; writes tau = A_ii ((a + d) at q_min - (a + d) at q_max).
 

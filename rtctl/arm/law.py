@@ -9,15 +9,38 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.arm.bounds import ApproachParams, Bounds, MotionLimits, SelfPairs, joint_bounds, self_bounds, tip_bound
 from rtctl.arm.escape import STALL
-from rtctl.arm.field import CAPPED, Field, FieldParams, LimitParams, field, joint_limit_field, own_field
+from rtctl.arm.field import (
+    CAPPED,
+    Field,
+    FieldParams,
+    LimitParams,
+    MovingPoints,
+    field,
+    joint_limit_field,
+    self_collision,
+)
 from rtctl.arm.flat import field_in, field_sizes
-from rtctl.arm.guards import approach_rows, fitting, guarded, joint_bounds, tip_row, yielding
+from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
+from rtctl.arm.least_change import Rows, rows_in, rows_sizes
 from rtctl.arm.model import Model
-from rtctl.arm.osc import MotionParams, OperationalSpace, motion_torque, velocity_reference
+from rtctl.arm.nearby import APPROACH_ZONE, CANDIDATES_MAX, Nearby, look_near, nearby_in
+from rtctl.arm.osc import (
+    POSTURE_DAMPER,
+    POSTURE_SPRING,
+    TASK_BRAKE,
+    TASK_DRIVE,
+    MotionParams,
+    OperationalSpace,
+    TaskDynamics,
+    Twist,
+    motion_torque,
+    velocity_reference,
+)
 from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
-from rtctl.kernel import kernel
-from rtctl.kernel.linalg import matvec
+from rtctl.arm.scaling import scale_drive_to_limits, scale_to_limits
+from rtctl.kernel import kernel, leaf_kernel
 from rtctl.types import F64, I32, I64, Cut, Record
 from rtctl.world.primitives import Obstacles
 
@@ -112,56 +135,28 @@ class Law(NamedTuple):
         return self.row(KEEP)
 
 
-@kernel
-def moved_points(P: F64, Jp: F64, dq: F64) -> F64:
-    """Return the PSPs now, P + Jp dq, (r, 3) [m]; dq = q - q of the evaluation.
+class Motion(NamedTuple):
+    """Where the joints are and what the tip is to do."""
 
-    Between evaluations the neglected term is half the centripetal acceleration times dt^2: 0.03 mm at 2 rad/s, 250 Hz.
+    q: F64  # (n,) [rad] now
+    qd: F64  # (n,)
+    actual: Twist  # the tip's velocity [m/s, rad/s]
+    error: Twist  # the way to go [m, rad]
+    previous: Twist  # velocity references of the last tick
+    q_rest: F64  # (n,) [rad] the posture
+    speed_scale: float  # fraction of qd_max that joints may have
+    qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
+
+
+def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles: Obstacles, motion: Motion) -> Law:
+    """Return the torques of `law` that take the tip where the motion wants it, and off whatever is near.
+
+    An error of zero with references that are not brakes along the path.
     """
-    rows, n = P.shape[0], dq.shape[0]
-    X = P.copy()
-    for r in range(rows):
-        for i in range(3):
-            for k in range(n):
-                X[r, i] += Jp[r, i, k] * dq[k]
-    return X
-
-
-@kernel
-def diagonal(A: F64) -> F64:
-    """Return the diagonal (n,) of a matrix (n, n)."""
-    out = np.empty(A.shape[0])
-    for i in range(A.shape[0]):
-        out[i] = A[i, i]
-    return out
-
-
-def evaluate_law(
-    robot: Robot,
-    model: Model,
-    space: OperationalSpace,
-    obstacles: Obstacles,
-    q: F64,
-    qd: F64,
-    xd: F64,
-    omega: F64,
-    e: F64,
-    e_rot: F64,
-    v_ref: F64,
-    w_ref: F64,
-    q_rest: F64,
-    pace: float,
-) -> Law:
-    """Return the torques that take the tip along e (3,) [m] and e_rot (3,) [rad], and off whatever is near.
-
-    q, qd (n,) now; xd, omega (3,) the tip's velocity; v_ref, w_ref (3,) the references of the previous tick;
-    q_rest (n,) the posture; pace: the fraction of qd_max that joints may have. e = e_rot = 0 with nonzero references
-    brakes along the path.
-    """
-    return Law(*_evaluate(
-        robot.constants, robot.points.radius, robot.points.link, robot.scratch,
-        model, space, obstacles, q, qd, xd, omega, e, e_rot, v_ref, w_ref, q_rest, pace,
-    ))  # fmt: skip
+    out = outputs(robot.n, len(obstacles.active))
+    cover, memory = Cover(robot.points.radius, robot.points.link), WorkMemory(robot.arm.reals, robot.arm.wholes)
+    rho_self, cut = law(robot.constants, cover, robot.scratch, model, space, obstacles, motion, memory, out)
+    return Law(out.task, out.torques, out.seen, out.nearest, rho_self, cut)
 
 
 def prepared(robot: Robot) -> Robot:
@@ -197,10 +192,10 @@ def prepared(robot: Robot) -> Robot:
         else:
             constants[k] = v
     m = len(robot.points.radius)
-    reals, wholes = field_sizes(robot.slots, m, robot.n)
+    reals, wholes = work_sizes(robot.slots, m, robot.n, len(robot.own.pairs))
     work = np.zeros(reals), np.zeros(wholes, np.int64)
     arm = Arm(constants, robot.points.radius, robot.points.link, *work)
-    return robot._replace(constants=constants, arm=arm, scratch=field_in(*work, robot.n, m))
+    return robot._replace(constants=constants, arm=arm, scratch=field_in(*work, robot.n, m, robot.slots))
 
 
 @kernel
@@ -212,13 +207,23 @@ def motion_params(c: Any) -> MotionParams:
     )  # fmt: skip
 
 
-@kernel
-def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, LimitParams]:
-    """Return the parameters that `prepared` put into the record c."""
-    return (
+class _Params(NamedTuple):
+    """The parameters that `prepared` put into its record."""
+
+    motion: MotionParams
+    avoid: FieldParams
+    self_collision: FieldParams
+    limit: LimitParams
+    dt: float
+
+
+@leaf_kernel
+def _params(c: Any, n: int) -> _Params:
+    """Return the parameters of n joints in the record c."""
+    return _Params(
         MotionParams(
             c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max,
-            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture[:n].copy(), c.motion_epsilon, c.motion_length,
+            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture[:n], c.motion_epsilon, c.motion_length,
             c.motion_speed_margin,
         ),
         FieldParams(
@@ -230,66 +235,227 @@ def _params(c: Any, n: int) -> tuple[MotionParams, FieldParams, FieldParams, Lim
             c.own_m_max,
         ),
         LimitParams(
-            c.limit_rho0[:n].copy(), c.limit_rho_min[:n].copy(), c.limit_rho_num[:n].copy(), c.limit_eta[:n].copy(),
-            c.limit_k_d[:n].copy(),
+            c.limit_rho0[:n], c.limit_rho_min[:n], c.limit_rho_num[:n], c.limit_eta[:n], c.limit_k_d[:n],
         ),
+        c.dt,
     )  # fmt: skip
+
+
+@leaf_kernel
+def _motion_limits(c: Any, n: int, speed_scale: float, qd_max: F64) -> MotionLimits:
+    """Return the limits of n joints in the record c; qd_max (n,) is where the speeds of this tick are put."""
+    for i in range(n):
+        qd_max[i] = speed_scale * c.qd_max[i]
+    return MotionLimits(c.q_min[:n], c.q_max[:n], qd_max, c.braking[:n], c.tau_max[:n], c.tau_rate[:n])
+
+
+# rows of the work array of a tick, (rows, n): first the four of `osc.motion_torque`, last those of the bounds
+_DQ, _QD_MAX, _SELF, _LIMITS, _REPEL, _LOAD, _DRIVE, _KEEP, _LOW, _HIGH, _DIAGONAL, _SUM, _SENT, _LESS, _ROWS = range(
+    4, 19
+)
+
+
+class Cover(NamedTuple):
+    """The spheres that stand for the links."""
+
+    radius: F64  # (m,) [m]
+    link: I64  # (m,)
+
+
+class WorkMemory(NamedTuple):
+    """Two flat arrays, first the field's (`flat.field_in`), then the law's; what a tick leaves there no other reads."""
+
+    reals: F64
+    wholes: I64
+
+
+class Outputs(NamedTuple):
+    """Where the law writes what `Law` names alike."""
+
+    task: F64  # (12,)
+    torques: F64  # (7, n)
+    seen: F64  # (4 K,)
+    nearest: I32  # (K,)
 
 
 @kernel
-def _evaluate(
-    constants: Record, radius: F64, link: I64, seen: Field,
-    model: Model, space: OperationalSpace, obstacles: Obstacles, q: F64, qd: F64, xd: F64, omega: F64,
-    e: F64, e_rot: F64, v_ref: F64, w_ref: F64, q_rest: F64, pace: float,
-) -> tuple[F64, F64, F64, I32, float, int]:  # fmt: skip
-    """Return the fields of `Law`.
+def outputs(n: int, slots: int) -> Outputs:
+    """Return the arrays of n joints and K = `slots` obstacles."""
+    return Outputs(np.empty(12), np.empty((7, n)), np.empty(4 * slots), np.empty(slots, np.int32))
 
-    One compiled call with few results: crossing the border costs as much as a term, and a tenth of that per array.
+
+class _Work(NamedTuple):
+    """Arrays that a tick works in."""
+
+    w: F64  # (rows, n) as above
+    most: F64  # (r,) bounds of the rows from _ROWS on
+    real: F64  # of the candidates; see `nearby.nearby_in`
+    whole: I64
+    made: I64  # (2n + r,) of the guards
+    rows: Rows
+
+
+def work_sizes(slots: int, m: int, n: int, pairs: int) -> tuple[int, int]:
+    """Return the sizes of the WorkMemory of K = `slots` obstacles, m points, n joints, L = `pairs` pairs of links."""
+    (a, b), (c, d) = field_sizes(slots, m, n), rows_sizes(n)
+    candidates, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    return a + (_ROWS + known) * n + known + candidates + 4 * m + n + 1 + c, b + 3 * candidates + 1 + 2 * n + known + d
+
+
+@leaf_kernel
+def _work_in(memory: WorkMemory, slots: int, m: int, n: int, pairs: int) -> _Work:
+    """Return the law's arrays in the memory; see `work_sizes`."""
+    c, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    a, b = n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)
+    most = a + (_ROWS + known) * n
+    real = most + known
+    rows = real + c + 4 * m + n + 1
+    made = b + 3 * c + 1
+    end = made + 2 * n + known
+    return _Work(
+        memory.reals[a:most].reshape(_ROWS + known, n), memory.reals[most:real], memory.reals[real:rows],
+        memory.wholes[b:made], memory.wholes[made:end],
+        rows_in(memory.reals[rows:], memory.wholes[end:], n),
+    )  # fmt: skip
+
+
+@leaf_kernel
+def _torques(
+    constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace, obstacles: Obstacles,
+    motion: Motion, task: F64, w: F64,
+) -> tuple[float, int, float]:  # fmt: skip
+    """Write the torques of the law without the guards into rows of w, and F, v_ref, w_ref into task (12,).
+
+    Returns the least distance between links [m], the flags of the field, and the share of what drives.
     """
-    c, n = constants[0], q.shape[0]
-    p, avoid, self_avoid, limit = _params(c, n)
-    q_min, q_max, tau_max, braking = c.q_min[:n].copy(), c.q_max[:n].copy(), c.tau_max[:n].copy(), c.braking[:n].copy()
-    tau_rate, qd_max, dt = c.tau_rate[:n].copy(), pace * c.qd_max[:n], c.dt
-    qd_free = qd - matvec(space.Jbar, np.concatenate((xd, omega)))
-    v, w = velocity_reference(
-        e, e_rot, v_ref, w_ref, space.Jbar, qd_free, qd_max, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max,
-        p.speed_margin, dt,
-    )  # fmt: skip
-    F, tau_drive, tau_brake, tau_rest, tau_damp = motion_torque(
-        model.J, model.Jdqd, space.Lambda, space.NT, model.A, xd, omega, v, w, q, qd, q_rest,
-        p.k_v, p.k_q, p.d_q, p.qdd_posture,
-    )  # fmt: skip
-    dq = q - model.q
-    X = moved_points(model.P, model.Jp, dq)
-    flags = field(X, model.Jp, model.B, qd, radius, link, obstacles, avoid, seen, True, True)
-    tau_own, rho_own, own_flags = own_field(model.own_rho, model.own_row, dq, qd, model.A_inv, self_avoid)
-    tau_limits = np.empty(q.shape[0])
-    joint_limit_field(q, qd, q_min, q_max, diagonal(model.A), limit, tau_limits)
-    load = model.g + model.h
-    tau_obstacles = seen.tau + tau_own
-    tau_obstacles *= fitting(tau_obstacles, load, tau_max)
-    tau_limits *= fitting(tau_limits, load, tau_max)
-    drive, keep = tau_drive + tau_rest, tau_brake + tau_damp + tau_obstacles + tau_limits
-    share = yielding(drive, load + keep, tau_max)  # before the guards: they judge what will be sent
-    drive = share * drive
-    low, high = joint_bounds(model.A, q, qd, q_min, q_max, qd_max, braking, tau_rate)
-    near, near_bounds = approach_rows(
-        seen.leader, link, seen.pairs, model.Jp, model.own_rho, model.own_row, dq, model.A_inv, qd, avoid.rho0,
-        self_avoid.rho_min, p.v_max, p.a_max, tau_rate,
-    )  # fmt: skip
-    rows, bounds = np.empty((near.shape[0] + 1, q.shape[0])), np.empty(near.shape[0] + 1)
-    rows[0], bounds[0] = tip_row(model.J, model.Jdqd, model.A_inv, xd, p.v_max, tau_rate)
-    rows[1:], bounds[1:] = near, near_bounds
-    net, guards = guarded(model.A, model.A_inv, drive + keep, load, tau_max, low, high, rows, bounds)
-    tau_guard = net - drive - keep
-    cut = _CAP if (flags | own_flags) & CAPPED else 0
-    cut |= _SPEED if guards else 0
+    q, qd, n = motion.q, motion.qd, motion.q.shape[0]
+    p, limits = _params(constants[0], n), _motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
+    reference = Twist(task[6:9], task[9:12])
+    velocity_reference(
+        motion.error, motion.previous, motion.actual, space.Jbar, qd, limits.qd_max, p.motion, p.dt, reference
+    )
+    at = TaskDynamics(model.J, model.Jdqd, model.A, space.Lambda, space.NT)
+    motion_torque(at, motion.actual, reference, q, qd, motion.q_rest, p.motion, task[:6], w)
+    for i in range(n):
+        w[_DQ, i], w[_DIAGONAL, i], w[_LOAD, i] = q[i] - model.q[i], model.A[i, i], model.g[i] + model.h[i]
+    dq, load, tau_max = w[_DQ], w[_LOAD], limits.tau_max
+    points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
+    flags = field(points, dq, qd, obstacles, p.avoid, seen, True, True)
+    rho_self, more = self_collision(model.own_rho, model.own_row, dq, qd, model.A_inv, p.self_collision, w[_SELF])
+    joint_limit_field(q, qd, limits.q_min, limits.q_max, w[_DIAGONAL], p.limit, w[_LIMITS])
+    for i in range(n):
+        w[_REPEL, i] = seen.tau[i] + w[_SELF, i]
+    repel, push = scale_to_limits(w[_REPEL], load, tau_max), scale_to_limits(w[_LIMITS], load, tau_max)
+    for i in range(n):
+        w[_REPEL, i] *= repel
+        w[_LIMITS, i] *= push
+        w[_DRIVE, i] = w[TASK_DRIVE, i] + w[POSTURE_SPRING, i]
+        w[_KEEP, i] = w[TASK_BRAKE, i] + w[POSTURE_DAMPER, i] + w[_REPEL, i] + w[_LIMITS, i]
+        w[_SELF, i] = load[i] + w[_KEEP, i]
+    share = scale_drive_to_limits(w[_DRIVE], w[_SELF], tau_max)  # before the guards: they judge what will be sent
+    for i in range(n):
+        w[_DRIVE, i] *= share
+        w[_SUM, i] = w[_DRIVE, i] + w[_KEEP, i]
+    return rho_self, flags | more, share
+
+
+@leaf_kernel
+def _bounds(w: F64, most: F64) -> Bounds:
+    return Bounds(w[_LOW], w[_HIGH], w[_ROWS:], most)
+
+
+@leaf_kernel
+def _bound(constants: Record, model: Model, motion: Motion, w: F64, most: F64) -> None:
+    """Write the bounds of joints, tip and pairs of links; w is what `_torques` left."""
+    n, bounds = motion.q.shape[0], _bounds(w, most)
+    p, limits = _params(constants[0], n), _motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
+    joint_bounds(model.A, motion.q, motion.qd, limits, bounds.low, bounds.high)
+    most[0] = tip_bound(
+        model.J, model.Jdqd, model.A_inv, motion.actual.linear, p.motion.v_max, limits.tau_rate, bounds.rows
+    )
+    pairs = SelfPairs(model.own_rho, model.own_row, w[_DQ])
+    self_bounds(pairs, model.A_inv, motion.qd, _approach(constants[0]), limits.tau_rate, bounds)
+
+
+@leaf_kernel
+def _near(constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work) -> Nearby:
+    c = constants[0]
+    points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
+    braking, tau_rate = _approach(c).braking, c.tau_rate[: motion.q.shape[0]]
+    return nearby_in(work.whole, work.real, points, seen, motion.qd, braking, tau_rate)
+
+
+@leaf_kernel
+def _let_pass(constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work) -> bool:
+    """Return whether no bound is passed; then row _SENT of the work is what may be sent."""
+    c, w = constants[0], work.w
+    near = _near(constants, cover, seen, model, motion, work)
+    work.whole[-1] = look_near(near, APPROACH_ZONE * c.avoid_rho0)
+    near = _near(constants, cover, seen, model, motion, work)
+    inertia, motors = Inertia(model.A, model.A_inv), Motors(w[_LOAD], c.tau_max[: motion.q.shape[0]])
+    return let_pass(inertia, motors, w[_SUM], _bounds(w, work.most), near, w[_SENT : _LESS + 1])
+
+
+@leaf_kernel
+def _hold_back(
+    constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work
+) -> bool:  # fmt: skip
+    """Write what the guards let pass into row _SENT of the work, which `_let_pass` left; return whether any acts."""
+    c, w = constants[0], work.w
+    near = _near(constants, cover, seen, model, motion, work)
+    inertia, motors = Inertia(model.A, model.A_inv), Motors(w[_LOAD], c.tau_max[: motion.q.shape[0]])
+    for i in range(motion.q.shape[0]):
+        work.rows.x[0, i] = motion.qdd[i]
+    bounds = _bounds(w, work.most)
+    return hold_back(work.rows, inertia, motors, w[_SUM], bounds, near, work.made, w[_SENT : _LESS + 1])
+
+
+@leaf_kernel
+def _approach(c: Any) -> ApproachParams:
+    return ApproachParams(c.avoid_rho0, c.own_rho_min, c.motion_v_max, c.motion_a_max)
+
+
+@leaf_kernel
+def _write(w: F64, share: float, torques: F64) -> None:
+    """Write the rows of Law.torques."""
+    for i in range(w.shape[1]):
+        guard = w[_SENT, i] - w[_DRIVE, i] - w[_KEEP, i]
+        torques[MOTION, i] = share * w[TASK_DRIVE, i] + w[TASK_BRAKE, i]
+        torques[POSTURE, i] = share * w[POSTURE_SPRING, i] + w[POSTURE_DAMPER, i]
+        torques[OBSTACLES, i], torques[LIMITS, i] = w[_REPEL, i], w[_LIMITS, i] + guard
+        torques[LOAD, i], torques[DRIVE, i] = w[_LOAD, i], w[_DRIVE, i]
+        torques[KEEP, i] = w[_LOAD, i] + w[_KEEP, i] + guard
+
+
+@leaf_kernel
+def _copy_seen(seen: Field, rho_force: F64, nearest: I32) -> None:
+    slots = nearest.shape[0]
+    for k in range(slots):
+        rho_force[k], nearest[k] = seen.rho_min[k], seen.nearest[k]
+        for i in range(3):
+            rho_force[slots + 3 * k + i] = seen.force[k, i]
+
+
+@leaf_kernel
+def law(
+    constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace, obstacles: Obstacles,
+    motion: Motion, memory: WorkMemory, out: Outputs,
+) -> tuple[float, int]:  # fmt: skip
+    """Write the torques of a tick into `out`; return the least distance between links [m], and Law.cut.
+
+    The whole law is one kernel without an array of its own, so that nothing is counted or allocated on the way.
+    """
+    n = motion.q.shape[0]
+    work = _work_in(memory, seen.leader.shape[0], cover.radius.shape[0], n, model.own_rho.shape[0])
+    rho_self, flags, share = _torques(constants, cover, seen, model, space, obstacles, motion, out.task, work.w)
+    _bound(constants, model, motion, work.w, work.most)
+    acts = False
+    if not _let_pass(constants, cover, seen, model, motion, work):
+        acts = _hold_back(constants, cover, seen, model, motion, work)
+    _write(work.w, share, out.torques)
+    _copy_seen(seen, out.seen, out.nearest)
+    cut = _CAP if flags & CAPPED else 0
+    cut |= _SPEED if acts else 0
     cut |= _SINGULAR if space.damped else 0
     cut |= _SCALED if share < 1.0 else 0
-    torques = np.empty((7, n))
-    torques[MOTION], torques[POSTURE] = share * tau_drive + tau_brake, share * tau_rest + tau_damp
-    torques[OBSTACLES], torques[LIMITS], torques[LOAD] = tau_obstacles, tau_limits + tau_guard, load
-    torques[DRIVE], torques[KEEP] = drive, load + keep + tau_guard
-    task = np.concatenate((F, v, w))
-    seen_by = np.concatenate((seen.rho_min, seen.force.copy().reshape(-1)))
-    return task, torques, seen_by, seen.nearest.astype(np.int32), rho_own, cut
+    return rho_self, cut

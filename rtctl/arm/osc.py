@@ -4,12 +4,13 @@ Khatib 1987 (the operational space formulation) and 1986 (the speed-limited goal
 1986 paper where one exists. World axes; tip rows are [linear; angular].
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.kernel import kernel
-from rtctl.kernel.linalg import matmul, matvec, symmetric_eigen, tmatvec
+from rtctl.kernel import kernel, leaf_kernel
+from rtctl.kernel.linalg import matmul, symmetric_eigen
 from rtctl.types import F64
 
 SPEED_FLOOR = 0.2  # fraction of qd_max that the null space cannot take from the tip: it never stands still for it
@@ -100,7 +101,7 @@ def operational_space(J: F64, A_inv: F64, Lambda_inv: F64, S: F64, p: MotionPara
     return OperationalSpace(*_operational_space(J, A_inv, Lambda_inv, S, p.epsilon, p.length))
 
 
-@kernel
+@leaf_kernel
 def approach_speed(d: float, k: float, v_max: float, a_max: float) -> float:
     """Return the speed towards a goal at distance d: min(v_max, k d) with its slope bounded by a_max.
 
@@ -108,102 +109,130 @@ def approach_speed(d: float, k: float, v_max: float, a_max: float) -> float:
     sqrt(2 a_max (d - a_max/(2 k^2))) that touches the line k d at d = a_max/k^2 takes over.
     """
     knee = a_max / (k * k)
-    v = k * d if d <= knee else np.sqrt(2.0 * a_max * (d - 0.5 * knee))
+    v = k * d if d <= knee else math.sqrt(2.0 * a_max * (d - 0.5 * knee))
     return min(v, v_max)
 
 
-@kernel
-def _towards(ref: F64, target: F64, step: float) -> F64:
-    """Return ref moved to target by at most `step` along the straight line between them."""
-    diff = target - ref
-    size = np.sqrt(diff[0] * diff[0] + diff[1] * diff[1] + diff[2] * diff[2])
+class Twist(NamedTuple):
+    """A velocity of the tip, or a way to go, in world axes."""
+
+    linear: F64  # (3,) [m/s or m]
+    angular: F64  # (3,) [rad/s or rad, a rotation vector]
+
+
+@leaf_kernel
+def _speed_per_distance(e: F64, k: float, v_max: float, a_max: float) -> float:
+    """Return the wanted speed along e (3,) over its length, 0 for none."""
+    d = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    return 0.0 if d < 1e-12 else approach_speed(d, k, v_max, a_max) / d
+
+
+@leaf_kernel
+def _slew(reference: F64, e: F64, speed: float, scale: float, step: float, out: F64) -> None:
+    """Write the reference (3,) moved to e speed scale by at most `step` along the straight line between them."""
+    dx = e[0] * speed * scale - reference[0]
+    dy = e[1] * speed * scale - reference[1]
+    dz = e[2] * speed * scale - reference[2]
+    size = math.sqrt(dx * dx + dy * dy + dz * dz)
     if size <= step:
-        return target.copy()
-    moved: F64 = ref + diff * (step / size)
-    return moved
+        for i in range(3):
+            out[i] = e[i] * speed * scale
+        return
+    f = step / size
+    out[0], out[1], out[2] = reference[0] + dx * f, reference[1] + dy * f, reference[2] + dz * f
 
 
-@kernel
-def _desired(e: F64, k: float, v_max: float, a_max: float) -> F64:
-    d = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    if d < 1e-12:
-        return np.zeros(3)
-    v: F64 = e * (approach_speed(d, k, v_max, a_max) / d)
-    return v
-
-
-@kernel
+@leaf_kernel
 def velocity_reference(
-    e: F64,
-    e_rot: F64,
-    v_ref: F64,
-    w_ref: F64,
+    error: Twist,
+    previous: Twist,
+    actual: Twist,
     Jbar: F64,
-    qd_free: F64,
+    qd: F64,
     qd_max: F64,
-    k: float,
-    v_max: float,
-    a_max: float,
-    w_max: float,
-    alpha_max: float,
-    margin: float,
+    p: MotionParams,
     dt: float,
-) -> tuple[F64, F64]:
-    """Return the slewed velocity references v_ref (3,) [m/s], w_ref (3,) [rad/s] of this tick.
+    out: Twist,
+) -> None:
+    """Write the slewed velocity references of this tick, [m/s] and [rad/s], into `out`.
 
-    e = x_goal - x [m], e_rot the rotation vector to the goal [rad]. The pair is scaled as one so that no joint is asked
-    for more than margin * qd_max (qd = Jbar [v; w] + qd_free, the latter (n,) of the null space [rad/s]): near a
-    singularity, or while the posture moves, the tip slows; it does not leave its line.
+    error: the way to the goal, x_goal - x [m] and the rotation vector [rad]; previous: the references of the last tick;
+    actual: the tip's velocity, of which the joints' velocities qd (n,) leave qd - Jbar [xd; omega] to the null space.
+    The pair is scaled as one so that no joint is asked for more than speed_margin * qd_max (n,): near a singularity, or
+    while the posture moves, the tip slows; it does not leave its line.
     """
-    v = _desired(e, k, v_max, a_max)
-    w = _desired(e_rot, k, w_max, alpha_max)
+    k = p.k_p / p.k_v
+    v, w = (
+        _speed_per_distance(error.linear, k, p.v_max, p.a_max),
+        _speed_per_distance(error.angular, k, p.w_max, p.alpha_max),
+    )
     scale = 1.0
     for i in range(Jbar.shape[0]):
-        qd = 0.0
+        asked = tip = 0.0
         for j in range(3):
-            qd += Jbar[i, j] * v[j] + Jbar[i, 3 + j] * w[j]
-        bound = max(margin * qd_max[i] - (qd_free[i] if qd > 0.0 else -qd_free[i]), SPEED_FLOOR * qd_max[i])
-        if abs(qd) * scale > bound:
-            scale = bound / abs(qd)
-    return _towards(v_ref, v * scale, a_max * dt), _towards(w_ref, w * scale, alpha_max * dt)
+            asked += Jbar[i, j] * (error.linear[j] * v) + Jbar[i, 3 + j] * (error.angular[j] * w)
+        for j in range(3):
+            tip += Jbar[i, j] * actual.linear[j]
+        for j in range(3):
+            tip += Jbar[i, 3 + j] * actual.angular[j]
+        free = qd[i] - tip
+        bound = max(p.speed_margin * qd_max[i] - (free if asked > 0.0 else -free), SPEED_FLOOR * qd_max[i])
+        if abs(asked) * scale > bound:
+            scale = bound / abs(asked)
+    _slew(previous.linear, error.linear, v, scale, p.a_max * dt, out.linear)
+    _slew(previous.angular, error.angular, w, scale, p.alpha_max * dt, out.angular)
 
 
-@kernel
+class TaskDynamics(NamedTuple):
+    """The inertia that the motion task works on."""
+
+    J: F64  # (6, n) tip Jacobian
+    Jdqd: F64  # (6,) its velocity product
+    A: F64  # (n, n) joint-space kinetic energy matrix
+    Lambda: F64  # (6, 6) of `OperationalSpace`
+    NT: F64  # (n, n)
+
+
+# rows of the torques that `motion_torque` writes, (4, n) [Nm]
+TASK_DRIVE, TASK_BRAKE, POSTURE_SPRING, POSTURE_DAMPER = 0, 1, 2, 3
+
+
+@leaf_kernel
 def motion_torque(
-    J: F64,
-    Jdqd: F64,
-    Lambda: F64,
-    NT: F64,
-    A: F64,
-    xd: F64,
-    omega: F64,
-    v_ref: F64,
-    w_ref: F64,
-    q: F64,
-    qd: F64,
-    q_rest: F64,
-    k_v: float,
-    k_q: float,
-    d_q: float,
-    qdd_posture: F64,
-) -> tuple[F64, F64, F64, F64, F64]:
-    """Return (F (6,), tau_drive, tau_brake, tau_rest, tau_damp), the torques (n,) [Nm].
+    at: TaskDynamics, actual: Twist, reference: Twist, q: F64, qd: F64, q_rest: F64, p: MotionParams, F: F64, out: F64
+) -> None:  # fmt: skip
+    """Write F*_m (6,) [m/s2, rad/s2] and the torques (4, n) [Nm] by the rows above (Khatib 1986 eq. 8, 1987).
 
-    F*_m = -k_v (xd - nu xd_d);  tau_motion = J^T Lambda (F*_m - Jd qd) = tau_drive + tau_brake
-    tau_posture = NT A (k_q (q_rest - q) - d_q qd) = tau_rest + tau_damp
+    F*_m = -k_v (xd - nu xd_d);  tau_motion = J^T Lambda (F*_m - Jd qd) = drive + brake
+    tau_posture = NT A (k_q (q_rest - q) - d_q qd) = spring + damper
 
     Each is split into the part that drives (scaled back first when torque runs out) and the part that only
     takes energy out (kept).
     """
     n = q.shape[0]
-    drive, brake = np.empty(6), np.empty(6)
     for i in range(3):
-        drive[i], drive[3 + i] = k_v * v_ref[i], k_v * w_ref[i]
-        brake[i], brake[3 + i] = -k_v * xd[i], -k_v * omega[i]
-    spring, damper = np.empty(n), np.empty(n)
+        F[i] = p.k_v * reference.linear[i] + -p.k_v * actual.linear[i]
+        F[3 + i] = p.k_v * reference.angular[i] + -p.k_v * actual.angular[i]
+    for r in range(4):
+        for k in range(n):
+            out[r, k] = 0.0
+    for i in range(6):
+        drive = brake = 0.0
+        for j in range(3):
+            drive += at.Lambda[i, j] * (p.k_v * reference.linear[j])
+            brake += at.Lambda[i, j] * (-p.k_v * actual.linear[j] - at.Jdqd[j])
+        for j in range(3):
+            drive += at.Lambda[i, 3 + j] * (p.k_v * reference.angular[j])
+            brake += at.Lambda[i, 3 + j] * (-p.k_v * actual.angular[j] - at.Jdqd[3 + j])
+        for k in range(n):
+            out[TASK_DRIVE, k] += at.J[i, k] * drive
+            out[TASK_BRAKE, k] += at.J[i, k] * brake
     for i in range(n):
-        spring[i] = min(max(k_q * (q_rest[i] - q[i]), -qdd_posture[i]), qdd_posture[i])
-        damper[i] = -d_q * qd[i]
-    tau_drive = tmatvec(J, matvec(Lambda, drive))
-    tau_brake = tmatvec(J, matvec(Lambda, brake - Jdqd))
-    return drive + brake, tau_drive, tau_brake, matvec(NT, matvec(A, spring)), matvec(NT, matvec(A, damper))
+        spring = damper = 0.0
+        for j in range(n):
+            bound = p.qdd_posture[j]
+            spring += at.A[i, j] * min(max(p.k_q * (q_rest[j] - q[j]), -bound), bound)
+            damper += at.A[i, j] * (-p.d_q * qd[j])
+        for k in range(n):
+            out[POSTURE_SPRING, k] += at.NT[k, i] * spring
+            out[POSTURE_DAMPER, k] += at.NT[k, i] * damper

@@ -13,11 +13,11 @@ import numpy as np
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import STOPS
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
-from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, _evaluate
+from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import command_torque
 from rtctl.arm.memory import HOT
 from rtctl.arm.model import Model
-from rtctl.arm.osc import OperationalSpace
+from rtctl.arm.osc import OperationalSpace, Twist
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
 from rtctl.arm.robot import Arm
@@ -180,11 +180,17 @@ def _act(
             q, model.qd, model.A, model.A_inv, model.h, model.g, model.x, model.R, model.J, model.Jdqd, model.P,
             model.Jp, model.B, model.Lambda_inv, model.own_rho, model.own_row,
         )  # fmt: skip
-    field = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0])
-    task, torques, seen, nearest, _, m.cut = _evaluate(
-        arm.constants, arm.radius, arm.link, field, at, space, around.obstacles, q, qd, xd, omega, e, e_rot,
-        m.v_ref.copy(), m.w_ref.copy(), q_rest, m.speed_scale,
+    slots = around.rho.shape[0]
+    field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
+    _, m.cut = law(
+        arm.constants, Cover(arm.radius, arm.link), field, at, space, around.obstacles,
+        Motion(
+            q, qd, Twist(xd, omega), Twist(e, e_rot), Twist(m.v_ref.copy(), m.w_ref.copy()), q_rest, m.speed_scale,
+            m.qdd[:n].copy(),
+        ),
+        WorkMemory(arm.reals, arm.wholes), out,
     )  # fmt: skip
+    task, torques, seen, nearest = out
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin
     m.v_ref[:], m.w_ref[:], m.tau_obstacles[:n] = task[6:9], task[9:], torques[OBSTACLES]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.kernel import ieee_kernel
+from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
 
 CAP_SHARE = 0.5  # of the clearance, where the repulsion is capped at the latest
@@ -54,15 +54,18 @@ class Field(NamedTuple):
     points: F64  # (15, m) position, velocity, mobility xx yy zz xy xz yz, force
     share: F64  # (K, n + 1) sum of a over the points of a link
     leader: I64  # (K,) first near slot of the group, -1 when not near
+    near: I64  # (K, m) points within the widest influence of the obstacle, ascending; the first `near_count` are meant
+    near_count: I64  # (K,) how many; of slots that are not near: anything
 
 
 def field_buffers(slots: int, m: int, n: int) -> Field:
     """Return zeroed arrays for K = `slots` obstacles, m points, n joints."""
     z = np.zeros
-    leader = z(slots, np.int64)
+    whole = np.int64
     return Field(
-        z(n), z(slots), z(slots, np.int64), z((slots, 3)), z((slots, 6, m)), z((15, m)), z((slots, n + 1)), leader
-    )
+        z(n), z(slots), z(slots, whole), z((slots, 3)), z((slots, 6, m)), z((15, m)), z((slots, n + 1)),
+        z(slots, whole), z((slots, m), whole), z(slots, whole),
+    )  # fmt: skip
 
 
 def eta_of(v_max: float, rho0: float, rho_min: float) -> float:
@@ -126,7 +129,7 @@ def limit_params(qd_max: F64, rho0: F64, rho_min: F64, dt: float, damping_ratio:
 
 
 # error_model: every divisor is a validated parameter or bounded by one; the check for zero would stop vectorisation.
-@ieee_kernel
+@leaf_kernel
 def firas(
     rho: float, rho_dot: float, rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float
 ) -> tuple[float, float]:

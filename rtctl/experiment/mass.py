@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.field import field
-from rtctl.arm.osc import MotionParams, motion_torque, velocity_reference
+from rtctl.arm.field import MovingPoints, field
+from rtctl.arm.osc import TASK_BRAKE, TASK_DRIVE, MotionParams, TaskDynamics, Twist, motion_torque, velocity_reference
 from rtctl.control.firas import FieldParams, field_buffers
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import Obstacles, distances, obstacles_empty, with_shape
@@ -61,7 +61,8 @@ class Mass:
 
     def push(self, x: F64, v: F64) -> F64:
         """Return the field's force (3,) [N] on the mass."""
-        field(x[None], self.Jp, self.B, v, self.radius, ONE, self.obstacles, self.params, self.out, True, True)
+        point = MovingPoints(x[None], self.Jp, self.B, self.radius, ONE)
+        field(point, ZERO3, v, self.obstacles, self.params, self.out, True, True)
         return self.out.tau.copy()
 
     def fly(
@@ -84,15 +85,17 @@ class Mass:
 
     def _pull(self, x: F64, v: F64, goal: F64, p: MotionParams, v_ref: F64, w_ref: F64) -> tuple[F64, F64, F64]:
         """Return the slewed references and the force (3,) of the motion task: tau = J^T Lambda F*."""
-        v_ref, w_ref = velocity_reference(
-            goal - x, ZERO3, v_ref, w_ref, J6.T.copy(), ZERO3, FAST, p.k_p / p.k_v, p.v_max, p.a_max, p.w_max,
-            p.alpha_max, p.speed_margin, self.dt,
-        )  # fmt: skip
-        _, drive, brake, _, _ = motion_torque(
-            J6, ZERO6, LAMBDA, np.zeros((3, 3)), EYE, v, ZERO3, v_ref, w_ref, x, v, x, p.k_v, p.k_q, p.d_q,
-            p.qdd_posture,
-        )  # fmt: skip
-        return v_ref, w_ref, drive + brake
+        at, actual, reference = (
+            TaskDynamics(J6, ZERO6, EYE, LAMBDA, np.zeros((3, 3))),
+            Twist(v, ZERO3),
+            Twist(*np.empty((2, 3))),
+        )
+        velocity_reference(
+            Twist(goal - x, ZERO3), Twist(v_ref, w_ref), actual, J6.T.copy(), v, FAST, p, self.dt, reference
+        )
+        F, parts = np.empty(6), np.empty((4, 3))
+        motion_torque(at, actual, reference, x, v, x, p, F, parts)
+        return reference.linear, reference.angular, parts[TASK_DRIVE] + parts[TASK_BRAKE]
 
 
 def potential(rho: F64, params: FieldParams) -> F64:

@@ -17,16 +17,30 @@ def kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     fastmath is off: sums keep their order, so that equal inputs give equal bits.
     """
-    return _compiled(function, "python")
+    return _compiled(function, "python", counting=True)
 
 
 def ieee_kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile as `kernel` does, without Python's test for division by zero: the loop then vectorises."""
-    return _compiled(function, "numpy")
+    return _compiled(function, "numpy", counting=True)
 
 
-def _compiled(function: Callable[_P, _R], errors: Literal["python", "numpy"]) -> Callable[_P, _R]:
-    compiled: Callable[_P, _R] = njit(fastmath=False, error_model=errors)(function)
+def leaf_kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Compile as `ieee_kernel` does a function that makes no arrays: no references are counted in it.
+
+    What it is given belongs to the caller. Each count would be an atomic addition; a dozen of them, two for each array
+    of a named tuple that is unpacked, cost as much as the distances of sixteen points. So would the call: an array is
+    seven numbers to pass, a model a hundred; it is compiled into its caller. An array made in it is an error when it is
+    compiled. It may return numbers; arrays only to another leaf: to a kernel or to Python they would not be its own.
+    """
+    return _compiled(function, "numpy", counting=False)
+
+
+def _compiled(function: Callable[_P, _R], errors: Literal["python", "numpy"], counting: bool) -> Callable[_P, _R]:
+    # _nrt is always said: unsaid, a kernel takes it from the one that is compiled first to call it
+    compiled: Callable[_P, _R] = njit(  # type: ignore[call-overload]
+        fastmath=False, error_model=errors, _nrt=counting, forceinline=not counting
+    )(function)
     if compiled is not function:  # it is, where NUMBA_DISABLE_JIT=1
         with suppress(LookupError):  # a script's or a shell's own kernels are compiled each time
             install(compiled, function)

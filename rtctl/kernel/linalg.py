@@ -12,10 +12,12 @@ from rtctl.types import F64
 @kernel
 def matvec(M: F64, v: F64) -> F64:
     """Return M v, (r, c) by (c,)."""
-    out = np.zeros(M.shape[0])
+    out = np.empty(M.shape[0])
     for i in range(M.shape[0]):
+        s = 0.0
         for j in range(M.shape[1]):
-            out[i] += M[i, j] * v[j]
+            s += M[i, j] * v[j]
+        out[i] = s
     return out
 
 

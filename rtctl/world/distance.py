@@ -9,13 +9,13 @@ Selections are written so that a NaN coordinate gives a NaN rho, never a plausib
 
 import math
 
-from rtctl.kernel import kernel
+from rtctl.kernel import leaf_kernel
 from rtctl.types import F64
 
 _TINY = 1e-200  # [m2] squared length below which a direction is not taken from a vector
 
 
-@kernel
+@leaf_kernel
 def sphere(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> None:
     """Sphere of radius dims[k, 0]; a point is one of radius 0. At the centre the normal is local z."""
     px, py, pz, r = p[k, 0], p[k, 1], p[k, 2], dims[k, 0]
@@ -32,7 +32,7 @@ def sphere(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> 
         out[k, 0, j] = d - r - radius[j]
 
 
-@kernel
+@leaf_kernel
 def capsule(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> None:
     """Capsule (or segment) of radius dims[k, 0], half length dims[k, 1] on local z; the normal on the axis is x."""
     px, py, pz, r, h = p[k, 0], p[k, 1], p[k, 2], dims[k, 0], dims[k, 1]
@@ -53,7 +53,7 @@ def capsule(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) ->
         out[k, 0, j] = d - r - radius[j]
 
 
-@kernel
+@leaf_kernel
 def plane(P: F64, radius: F64, R: F64, p: F64, k: int, out: F64) -> None:
     """Half-space below local z = 0; the normal is local z everywhere."""
     px, py, pz = p[k, 0], p[k, 1], p[k, 2]
@@ -65,7 +65,7 @@ def plane(P: F64, radius: F64, R: F64, p: F64, k: int, out: F64) -> None:
         out[k, 3, j] = zz
 
 
-@kernel
+@leaf_kernel
 def box(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> None:
     """Box of half sizes dims[k, :3]; inside, the nearest face, of equal ones the first of x, y, z, positive side."""
     px, py, pz, a, b, c = p[k, 0], p[k, 1], p[k, 2], dims[k, 0], dims[k, 1], dims[k, 2]
@@ -96,7 +96,7 @@ def box(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> Non
         out[k, 0, j] = (d if apart else (u if u >= side else side)) - radius[j]
 
 
-@kernel
+@leaf_kernel
 def cone(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, out: F64) -> None:
     """Truncated cone about local z, or cylinder: radius dims[k, 0] at -h, dims[k, 1] at h = dims[k, 2].
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.kernel import kernel
+from rtctl.kernel import kernel, leaf_kernel
 from rtctl.kernel.rotations import R_of, compose, exp3
 from rtctl.types import B1, F64, I64, Shape
 from rtctl.world import distance as exact
@@ -232,25 +232,24 @@ def advanced_pose(active: B1, p: F64, R: F64, v: F64, w: F64, dt: float) -> tupl
     return p, R
 
 
-@kernel
+@leaf_kernel
 def speed_bound(obstacles: Obstacles) -> float:
     """Return a bound on the speed [m/s] of any surface point of any active obstacle; infinite for a turning plane."""
-    bound = 0.0
+    bound, v, w = 0.0, obstacles.v, obstacles.w
     for k in range(obstacles.active.shape[0]):
         if obstacles.active[k]:
-            v, w = obstacles.v[k], obstacles.w[k]
-            speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-            turn = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+            speed = math.sqrt(v[k, 0] * v[k, 0] + v[k, 1] * v[k, 1] + v[k, 2] * v[k, 2])
+            turn = math.sqrt(w[k, 0] * w[k, 0] + w[k, 1] * w[k, 1] + w[k, 2] * w[k, 2])
             if turn > 0.0:
-                speed += math.inf if obstacles.kind[k] == PLANE else turn * _reach(obstacles.dims[k])
+                speed += math.inf if obstacles.kind[k] == PLANE else turn * _reach(obstacles.dims, k)
             bound = speed if not speed <= bound else bound
     return bound
 
 
-@kernel
-def _reach(dims: F64) -> float:
+@leaf_kernel
+def _reach(dims: F64, k: int) -> float:
     """Return a radius about the frame that holds a primitive of any kind with these dims (the sum bounds them all)."""
-    reach: float = dims[0] + dims[1] + dims[2]
+    reach: float = dims[k, 0] + dims[k, 1] + dims[k, 2]
     return reach
 
 
@@ -290,6 +289,18 @@ def _superquadric(P: F64, radius: F64, R: F64, p: F64, dims: F64, k: int, cutoff
 
 
 @kernel
+def _dear(P: F64, radius: F64, obstacles: Obstacles, k: int, cutoff: float, out: F64) -> None:
+    """Distances to the kinds that ask their bounding box first."""
+    R, p, dims = obstacles.R, obstacles.p, obstacles.dims
+    if obstacles.kind[k] == MESH:
+        tree.many(P, radius, R, p, k, obstacles.mesh, int(dims[k, 3]), 0.0, cutoff, out)
+    elif obstacles.kind[k] == CLOUD:
+        tree.many(P, radius, R, p, k, obstacles.clouds[int(dims[k, 3])], 0, dims[k, 0], cutoff, out)
+    else:
+        _superquadric(P, radius, R, p, dims, k, cutoff, out)
+
+
+@leaf_kernel
 def distances_into(P: F64, radius: F64, obstacles: Obstacles, cutoff: float, out: F64) -> None:
     """Write the distances of points to every active obstacle, obstacle-outer, point-inner.
 
@@ -305,7 +316,8 @@ def distances_into(P: F64, radius: F64, obstacles: Obstacles, cutoff: float, out
     for k in range(obstacles.active.shape[0]):
         kind, margin = obstacles.kind[k], obstacles.margin[k]
         if not obstacles.active[k]:
-            out[k, 0, :] = math.inf
+            for j in range(radius.shape[0]):
+                out[k, 0, j] = math.inf
             continue
         if kind == SPHERE:
             exact.sphere(P, radius, R, p, dims, k, out)
@@ -317,12 +329,8 @@ def distances_into(P: F64, radius: F64, obstacles: Obstacles, cutoff: float, out
             exact.box(P, radius, R, p, dims, k, out)
         elif kind == CONE:
             exact.cone(P, radius, R, p, dims, k, out)
-        elif kind == MESH:
-            tree.many(P, radius, R, p, k, obstacles.mesh, int(dims[k, 3]), 0.0, cutoff + margin, out)
-        elif kind == CLOUD:
-            tree.many(P, radius, R, p, k, obstacles.clouds[int(dims[k, 3])], 0, dims[k, 0], cutoff + margin, out)
         else:
-            _superquadric(P, radius, R, p, dims, k, cutoff + margin, out)
+            _dear(P, radius, obstacles, k, cutoff + margin, out)
         if margin > 0.0:
             for j in range(radius.shape[0]):
                 out[k, 0, j] -= margin

@@ -1,0 +1,327 @@
+"""The guards against their promises, and their search against another solver."""
+
+import numpy as np
+import pytest
+import quadprog
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtctl.arm.bounds import (
+    SPEED_BAND,
+    SPEED_HORIZON,
+    ApproachParams,
+    Bounds,
+    MotionLimits,
+    SelfPairs,
+    approach_bound,
+    joint_bounds,
+    self_bounds,
+    tip_bound,
+)
+from rtctl.arm.field import Field, MovingPoints, field, field_buffers, field_params
+from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
+from rtctl.arm.joint_field import own_field
+from rtctl.arm.least_change import SOFTNESS, rows_in, rows_sizes
+from rtctl.arm.model import Model
+from rtctl.arm.nearby import Nearby, look_near, nearby_in
+from rtctl.arm.scaling import scale_to_limits
+from rtctl.types import F64, Shape
+from rtctl.world.primitives import obstacles_empty, with_shape
+from tests.arms import PANDA_HOME, states
+from tests.lab import robot, sphere
+from tests.test_law import ZERO, model_at
+
+FREE = np.full(7, np.inf)
+
+
+def bounds_of(low: F64, high: F64, rows: F64 | None = None, most: F64 | None = None) -> Bounds:
+    rows = np.zeros((0, len(low))) if rows is None else rows
+    return Bounds(low, high, rows, np.zeros(0) if most is None else most)
+
+
+def looked(points: MovingPoints, seen: Field, qd: F64, zone: float, braking: float, rate: F64) -> Nearby:
+    """Return the points nearer than `zone` [m] to obstacles, with their cheap bounds."""
+    room, m, n = len(seen.leader) * len(points.radius), len(points.radius), len(qd)
+    whole, real = np.zeros(3 * room + 1, np.int64), np.zeros(room + 4 * m + n + 1)
+    views = getattr(nearby_in, "py_func", nearby_in)  # a leaf kernel gives arrays to leaf kernels alone
+    whole[-1] = look_near(views(whole, real, points, seen, qd, braking, rate), zone)
+    near: Nearby = views(whole, real, points, seen, qd, braking, rate)
+    return near
+
+
+def sent_of(
+    inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: Nearby, start: F64 | None = None
+) -> tuple[F64, bool]:
+    """Return what the guards let pass of tau (n,) [Nm], and whether any acts, as the law asks them."""
+    n, work = len(tau), np.zeros((2, len(tau)))
+    if let_pass(inertia, motors, tau, bounds, near, work):
+        return work[0], False
+    real, whole = rows_sizes(n)
+    rows = getattr(rows_in, "py_func", rows_in)(np.zeros(real), np.zeros(whole, np.int64), n)
+    rows.x[0] = 0.0 if start is None else start
+    acts = hold_back(rows, inertia, motors, tau, bounds, near, np.zeros(2 * n + len(bounds.most), np.int64), work)
+    return work[0], acts
+
+
+def guard(
+    A: F64, A_inv: F64, tau: F64, low: F64, high: F64, rows: F64, most: F64, start: F64 | None = None
+) -> tuple[F64, bool]:
+    """Return what the guards add (n,) [Nm] to a torque that the motors always have, and whether they act."""
+    n = len(tau)
+    nothing = MovingPoints(
+        np.zeros((0, 3)), np.zeros((0, 3, n)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, np.int64)
+    )
+    near = looked(nothing, field_buffers(0, 0, n), np.zeros(n), 0.05, 5.0, np.ones(n))
+    motors = Motors(np.zeros(n), np.full(n, np.inf))
+    out, acts = sent_of(Inertia(A, A_inv), motors, tau, bounds_of(low, high, rows, most), near, start)
+    return out - tau, acts
+
+
+MIN, MAX, FASTEST, BRAKING = np.full(7, -2.0), np.full(7, 2.0), np.full(7, 2.0), np.full(7, 10.0)
+RATE = np.full(7, 1000.0)
+NO_ROWS, NO_BOUNDS = np.zeros((0, 7)), np.zeros(0)
+angle = st.floats(-2.2, 2.2)
+speed = st.floats(-3.0, 3.0)
+vector = st.lists(st.floats(-100.0, 100.0), min_size=7, max_size=7).map(np.array)
+
+
+def joints_guarded(tau: F64, q: F64, qd: F64) -> tuple[F64, F64, bool]:
+    """Return the accelerations without and with the guard on the joints, and whether it acted."""
+    model = model_at(PANDA_HOME, np.zeros(7))
+    low, high = np.empty(7), np.empty(7)
+    joint_bounds(model.A, q, qd, MotionLimits(MIN, MAX, FASTEST, BRAKING, FREE, RATE), low, high)
+    added, acts = guard(model.A, model.A_inv, tau, low, high, NO_ROWS, NO_BOUNDS)
+    return model.A_inv @ tau, model.A_inv @ (tau + added), acts
+
+
+@given(tau=vector, q=st.lists(angle, min_size=7, max_size=7), qd=st.lists(speed, min_size=7, max_size=7))
+def test_no_joint_is_accelerated_to_where_it_could_not_stop(tau: F64, q: list[float], qd: list[float]):
+    at, moving = np.array(q), np.array(qd)
+    _, qdd, acts = joints_guarded(tau, at, moving)
+    bound_up = np.minimum(SPEED_BAND * FASTEST, np.sqrt(2 * BRAKING * np.maximum(0.0, MAX - at)))
+    bound_down = np.minimum(SPEED_BAND * FASTEST, np.sqrt(2 * BRAKING * np.maximum(0.0, at - MIN)))
+    soon = moving + qdd * SPEED_HORIZON
+    assert (soon <= bound_up + 1e-9).all()
+    assert (soon >= -bound_down - 1e-9).all()
+    assert acts or (soon == moving + joints_guarded(tau, at, moving)[0] * SPEED_HORIZON).all()
+
+
+def nearest(A: F64, wanted: F64, C: F64, b: F64) -> F64:
+    """Return argmin (x - w)^T A (x - w)/2 + sum s^2/(2 softness c A^-1 c^T) with C x - s <= b, by another solver."""
+    n, r = C.shape[1], len(b)
+    size = np.einsum("ci,ij,cj->c", C, np.linalg.inv(A), C)
+    G = np.zeros((n + r, n + r))
+    G[:n, :n], G[n:, n:] = A, np.diag(1.0 / (SOFTNESS * size))
+    scale = 1.0 / np.sqrt(np.diag(G))  # or its own test for singular matrices refuses
+    found = quadprog.solve_qp(
+        G * scale * scale[:, None],
+        scale * np.append(A @ wanted, np.zeros(r)),
+        (np.hstack((-C, np.eye(r))) * scale).T,
+        -b,
+    )[0]
+    x: F64 = scale[:n] * found[:n]
+    return x
+
+
+@given(seed=st.integers(0, 1 << 32), rows=st.integers(0, 40), contradicting=st.booleans(), start=st.booleans())
+def test_what_the_guards_change_is_the_least_that_keeps_every_bound(
+    seed: int, rows: int, contradicting: bool, start: bool
+):
+    """Against quadprog, on bounds that can all be kept and on those that cannot."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 9))
+    M = rng.normal(size=(n, n))
+    A = M @ M.T + 0.1 * np.eye(n)
+    A_inv, wanted = np.linalg.inv(A), rng.normal(0.0, 20.0, n)
+    C, feasible = rng.normal(size=(rows, n)), rng.normal(size=n)
+    b = C @ feasible + rng.uniform(-3.0 if contradicting else 0.0, 3.0, rows)
+    low, high = feasible - rng.uniform(0.1, 20.0, n), feasible + rng.uniform(0.1, 20.0, n)
+    added, acts = guard(A, A_inv, A @ wanted, low, high, C, b, rng.normal(size=n) if start else None)
+    found = wanted + A_inv @ added
+    best = nearest(A, wanted, np.vstack((np.eye(n), -np.eye(n), C)), np.concatenate((high, -low, b)))
+    np.testing.assert_allclose(found, np.clip(best, low, high), atol=1e-5 * (1.0 + np.abs(best).max()))
+    assert acts == bool((wanted > high).any() or (wanted < low).any() or (C @ wanted > b).any())
+
+
+def test_a_push_away_stays_one_when_a_joint_is_at_its_stop():
+    """Cutting the joint's own acceleration alone would turn it round in some postures."""
+    cut_alone, guarded_too = [], []
+    for q, _, _ in states(robot().body, 60, seed=5):
+        model, zero = model_at(q, np.zeros(7)), np.zeros(7)
+        for j in range(0, len(model.P), 3):
+            row = model.Jp[j, 0]
+            tau = 30.0 * row
+            qdd = model.A_inv @ tau
+            for i in range(7):
+                stopped = np.where(np.arange(7) == i, 0.0, qdd)
+                high = np.where(np.arange(7) == i, 0.0, 1e3)
+                added, _ = guard(model.A, model.A_inv, tau, -high, high, NO_ROWS, NO_BOUNDS)
+                cut_alone.append(row @ stopped)
+                guarded_too.append(row @ (model.A_inv @ (tau + added)))
+        assert not zero.any()
+    assert min(cut_alone) < -1.0
+    assert min(guarded_too) > -1e-6
+
+
+def test_the_guard_is_quiet_where_there_is_nothing_to_guard():
+    _, _, acts = joints_guarded(np.full(7, 0.01), np.zeros(7), np.zeros(7))
+    assert not acts
+
+
+@given(q=angle, qd=speed, push=st.floats(-50.0, 50.0))
+def test_the_guard_treats_up_and_down_alike(q: float, qd: float, push: float):
+    one = joints_guarded(np.full(7, push), np.full(7, q), np.full(7, qd))[1]
+    other = joints_guarded(np.full(7, -push), np.full(7, -q), np.full(7, -qd))[1]
+    np.testing.assert_allclose(one, -other, atol=1e-9)
+
+
+@given(tau=vector, direction=st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3), v=st.floats(0.01, 1.5))
+def test_the_tip_is_not_pushed_past_its_speed(tau: F64, direction: list[float], v: float):
+    size = float(np.linalg.norm(direction))
+    if size < 0.1:
+        return
+    u = np.array(direction) / size
+    model = model_at(PANDA_HOME, np.zeros(7))
+    row = np.zeros((1, 7))
+    bound = tip_bound(model.J, np.zeros(6), model.A_inv, v * u, 0.5, RATE, row)
+    low = np.full(7, -1e6)
+    added, acts = guard(model.A, model.A_inv, tau, low, -low, row, np.array([bound]))
+    before, after = (u @ model.J[:3] @ model.A_inv @ t for t in (tau, tau + added))
+    if acts:
+        assert v + after * SPEED_HORIZON <= max(0.5, v) + 2e-3
+        assert after == pytest.approx(bound, abs=0.1)
+    else:
+        assert after == before
+        assert v < 0.05 or v + before * SPEED_HORIZON <= 0.5 + 1e-9
+
+
+def beside_wall(x: float, v: float) -> tuple[MovingPoints, Field]:
+    """Return a point of a kilogram at x [m] that moves at v [m/s] before a wall at 0, and what the field measures."""
+    upright = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
+    wall = with_shape(obstacles_empty(2), 0, Shape("wall", "plane", np.zeros(4), ZERO, upright, ZERO, ZERO))
+    point = MovingPoints(np.array([[x, 0.0, 0.0]]), np.eye(3)[None], np.eye(3)[None], np.zeros(1), np.ones(1, np.int64))
+    seen = field_buffers(2, 1, 3)
+    field(
+        point, ZERO, np.array([v, 0.0, 0.0]), wall, field_params(0.5, 0.1, 0.02, 1e-3, 0.7, 0.0, 50.0), seen, True, True
+    )
+    return point, seen
+
+
+@pytest.mark.parametrize("pull", [1.0, 30.0, 1000.0])
+def test_nothing_is_pulled_into_what_is_near(pull: float):
+    """A point of a kilogram, one period of delay, a force towards a wall however large: it stops short of it."""
+    eye, rate = np.eye(3), np.full(3, 2000.0)
+    x, v, sent, least = 0.049, -0.5, 0.0, np.inf
+    for _ in range(1500):
+        qd = np.array([v, 0.0, 0.0])
+        near = looked(*beside_wall(x, v), qd, 0.05, 5.0, rate)
+        tau, low = np.array([-pull, 0.0, 0.0]), np.full(3, -1e6)
+        asked = sent_of(Inertia(eye, eye), Motors(ZERO, FREE[:3]), tau, bounds_of(low, -low), near)[0][0]
+        v, x = v + 1e-3 * sent, x + 1e-3 * v
+        sent = np.clip(asked, sent - 2.0, sent + 2.0)
+        least = min(least, x)
+    assert 0.0 < least < 0.01
+    assert abs(v) < 0.01
+
+
+def crowd(seed: int, slots: int = 24) -> tuple[Model, MovingPoints, Field, F64, F64]:
+    """Return the arm among balls near its links: model, points, what the field measures, qd, torque rates."""
+    rng, arm = np.random.default_rng(seed), robot()
+    qd = 0.1 * rng.normal(size=7)
+    model, table = model_at(PANDA_HOME + 0.2 * rng.normal(size=7), qd), obstacles_empty(slots)
+    for k in range(slots):
+        j, away = int(rng.integers(len(arm.points.radius))), rng.normal(size=3)
+        away *= (arm.points.radius[j] + 0.02 + rng.uniform(0.005, 0.06)) / np.linalg.norm(away)
+        table = with_shape(table, k, sphere(str(k), (model.P[j] + away).tolist(), 0.02))
+    points = MovingPoints(model.P, model.Jp, model.B, arm.points.radius, arm.points.link)
+    seen = field_buffers(slots, len(arm.points.radius), 7)
+    field(points, np.zeros(7), qd, table, arm.avoid, seen, True, True)
+    return model, points, seen, qd, arm.tau_rate
+
+
+def explicit(model: Model, points: MovingPoints, seen: Field, qd: F64, rate: F64) -> tuple[F64, F64]:
+    """Return every row that approaches an obstacle in the zone, and its bound, by the words of the docstrings alone."""
+    rows, most, p = [], [], robot()
+    for k in range(len(seen.rho_min)):
+        rho = seen.pairs[k, 0]
+        for link in range(8):
+            mine = (points.link == link) & (rho < 0.5 * p.avoid.rho0)
+            if not mine.any():
+                continue
+            for j in np.flatnonzero(mine & (rho < rho[mine].min() + 0.02)):
+                row = -seen.pairs[k, 1:4, j] @ points.Jp[j]
+                jerk = 0.5 * (row @ model.A_inv @ row) / max(1e-9, float((np.abs(row) / rate).max()))
+                rows.append(row)
+                most.append(approach_bound(rho[j], float(row @ qd), np.inf, p.motion.a_max, jerk))
+    return np.array(rows).reshape(-1, 7), np.array(most)
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 1 << 32), force=st.floats(0.0, 100.0))
+def test_rows_that_are_made_only_when_passed_give_the_answer_of_all_of_them(seed: int, force: float):
+    model, points, seen, qd, rate = crowd(seed)
+    tau = force * np.random.default_rng(seed + 1).normal(size=7)
+    C, b = explicit(model, points, seen, qd, rate)
+    low = np.full(7, -1e3)
+    near = looked(points, seen, qd, 0.5 * robot().avoid.rho0, robot().motion.a_max, rate)
+    assert near.size == len(b)
+    got, _ = sent_of(Inertia(model.A, model.A_inv), Motors(np.zeros(7), FREE), tau, bounds_of(low, -low), near)
+    wanted = model.A_inv @ tau
+    best = nearest(model.A, wanted, np.vstack((np.eye(7), -np.eye(7), C)), np.concatenate((-low, -low, b)))
+    np.testing.assert_allclose(model.A_inv @ got, np.clip(best, low, -low), atol=1e-5 * (1.0 + np.abs(best).max()))
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 1 << 32))
+def test_cheap_bounds_are_never_above_the_true_ones(seed: int):
+    model, points, seen, qd, rate = crowd(seed)
+    _, b = explicit(model, points, seen, qd, rate)
+    near = looked(points, seen, qd, 0.5 * robot().avoid.rho0, robot().motion.a_max, rate)
+    assert (np.diff(points.link) >= 0).all()  # so both lists have the same order
+    assert (near.found.most[: near.size] <= b).all()
+    assert not near.size or (near.found.most[: near.size] < b).any()
+
+
+@given(tau=vector, load=vector)
+def test_a_field_beyond_the_motors_loses_strength_not_direction(tau: F64, load: F64):
+    tau_max = np.array([80.0, 80.0, 80.0, 80.0, 11.0, 11.0, 11.0])
+    share = scale_to_limits(tau, load, tau_max)
+    assert 0.0 < share <= 1.0
+    spare = np.minimum(tau_max, tau_max - np.sign(tau) * load)
+    assert (np.abs(share * tau) <= np.maximum(spare, 0.2 * tau_max) * (1 + 1e-9)).all()
+    assert share == 1.0 or (np.abs(share * tau) >= np.maximum(spare, 0.2 * tau_max) * (1 - 1e-9)).any()
+
+
+def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch():
+    """A kilogram between them, torque that takes 20 ms to brake: their field alone throws them back at 1.9 m/s."""
+    arm, eye, least, back = robot(), np.eye(3), np.inf, 0.0
+    params, row = arm.self_avoid, np.array([[1.0, 0.0, 0.0]])
+    x, v, sent, step = arm.own.reach, -0.5, 0.0, 0.25  # [m], [m/s], [N], [N] in a period
+    for _ in range(400):
+        qd, rho = np.array([v, 0.0, 0.0]), np.array([x if x < arm.own.reach else np.inf])
+        push, _, _ = own_field(rho, row, ZERO, qd, eye, params)
+        low = np.full(3, -1e6)
+        bounds = Bounds(low, -low, np.zeros((2, 3)), np.full(2, np.inf))
+        approach = ApproachParams(arm.avoid.rho0, params.rho_min, arm.motion.v_max, arm.motion.a_max)
+        self_bounds(SelfPairs(rho, row, ZERO), eye, qd, approach, np.full(3, 1e3 * step), bounds)
+        added, _ = guard(eye, eye, push, low, -low, bounds.rows, bounds.most)
+        sent += np.clip((push + added)[0] - sent, -step, step)
+        v, x = v + 1e-3 * sent, x + 1e-3 * v
+        least, back = min(least, x), max(back, v)
+    assert least > 0.5 * params.rho_min
+    assert back < 0.25  # half of what it came with
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_start_that_is_not_a_number_changes_nothing(value: float):
+    rng = np.random.default_rng(3)
+    model, tau, rows, low = (
+        model_at(PANDA_HOME, np.zeros(7)),
+        rng.normal(0.0, 20.0, 7),
+        rng.normal(size=(3, 7)),
+        np.full(7, -5.0),
+    )
+    from_rest = guard(model.A, model.A_inv, tau, low, -low, rows, np.ones(3))
+    from_there = guard(model.A, model.A_inv, tau, low, -low, rows, np.ones(3), np.full(7, value))
+    assert from_there[0].tobytes() == from_rest[0].tobytes()
+    assert from_rest[1]
