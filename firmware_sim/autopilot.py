@@ -15,9 +15,17 @@ GUIDED, HOLD, MANUAL = 15, 4, 0  # custom modes of ArduPilot Rover
 OFFBOARD, LOITER, PX4_MANUAL = 6 << 16, 4 << 16 | 3 << 24, 1 << 16
 SCHEDULER_HZ = 40.0  # the fastest stream of a 50 Hz scheduler
 STREAMS = {
-    32: "local", 30: "attitude", 331: "odometry", 193: "ekf", 230: "estimator", 49: "origin", 24: "gps", 33: "global",
-    242: "home", 148: "version",
-}  # fmt: skip
+    32: "local",
+    30: "attitude",
+    331: "odometry",
+    193: "ekf",
+    230: "estimator",
+    49: "origin",
+    24: "gps",
+    33: "global",
+    242: "home",
+    148: "version",
+}
 UNASKED_HZ = 4.0  # of what it streams when nobody may ask
 DEAD_RECKONING = 8.0  # [s] that ArduPilot goes on by its wheels and gyroscopes without a GPS, and says nothing
 BIAS_TURN = 0.05  # [rad/s] by which the bias of the reported speed turns
@@ -268,9 +276,7 @@ class Autopilot:
             self.offset = (self.offset[0] + east * dt, self.offset[1] + north * dt)
         if rate:
             angle = 0.1 * self.time
-            self.offset = (
-                self.offset[0] + rate * math.cos(angle) * dt, self.offset[1] + rate * math.sin(angle) * dt
-            )  # fmt: skip
+            self.offset = (self.offset[0] + rate * math.cos(angle) * dt, self.offset[1] + rate * math.sin(angle) * dt)
         if not self.armed:
             self.home = (self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
 
@@ -330,9 +336,11 @@ class Autopilot:
             x, y = x - self.home[0], y - self.home[1]
         shake = self.random.gauss
         return (
-            y + shake(0.0, POSITION_NOISE), x + shake(0.0, POSITION_NOISE),
-            north + shake(0.0, SPEED_NOISE), east + shake(0.0, SPEED_NOISE),
-        )  # fmt: skip
+            y + shake(0.0, POSITION_NOISE),
+            x + shake(0.0, POSITION_NOISE),
+            north + shake(0.0, SPEED_NOISE),
+            east + shake(0.0, SPEED_NOISE),
+        )
 
     def _yaw(self) -> float:
         return math.remainder(0.5 * math.pi - self.vehicle.yaw, 2.0 * math.pi)
@@ -349,9 +357,24 @@ class Autopilot:
         q = (math.cos(half), 0.0, 0.0, math.sin(half))
         none = [math.nan] * 21
         return self.end.codec.odometry_encode(
-            round(self.uptime * 1e6), 1, 12, x, y, 0.0, q, *body, 0.0, 0.0, 0.0, -self.vehicle.w, none, none,
-            self.resets % 256, 2, 100,
-        )  # fmt: skip
+            round(self.uptime * 1e6),
+            1,
+            12,
+            x,
+            y,
+            0.0,
+            q,
+            *body,
+            0.0,
+            0.0,
+            0.0,
+            -self.vehicle.w,
+            none,
+            none,
+            self.resets % 256,
+            2,
+            100,
+        )
 
     def _attitude(self) -> Any:
         return self.end.codec.attitude_encode(self._ms(), 0.0, 0.0, self._yaw(), 0.0, 0.0, -self.vehicle.w)
@@ -372,9 +395,17 @@ class Autopilot:
         fix = 1 if self.gps_lost_at is not None or self.uptime < self.cold else 6
         lat, lon = self._place(self.vehicle.x, self.vehicle.y)
         return self.end.codec.gps_raw_int_encode(
-            round(self.uptime * 1e6), fix, lat, lon, 584000, 80 if fix > 3 else 9999, 65535, 65535, 65535,
+            round(self.uptime * 1e6),
+            fix,
+            lat,
+            lon,
+            584000,
+            80 if fix > 3 else 9999,
+            65535,
+            65535,
+            65535,
             14 if fix > 3 else 2,
-        )  # fmt: skip
+        )
 
     def _global(self) -> Any:
         _, _, north, east = self._ned()

@@ -13,9 +13,20 @@ CLOUD_PERIOD_NS = 33_333_333
 CLOUD_MARK = b"RTCLOUD1"
 RETRY_NS = 500_000_000
 DROPPED_KEYS = frozenset(
-    ("waypoints", "appears_s", "vanishes_s", "rpy_rad", "normal", "file", "scale", "hull", "voxel_m", "position_m",
-     "velocity_m_s")
-)  # fmt: skip
+    (
+        "waypoints",
+        "appears_s",
+        "vanishes_s",
+        "rpy_rad",
+        "normal",
+        "file",
+        "scale",
+        "hull",
+        "voxel_m",
+        "position_m",
+        "velocity_m_s",
+    )
+)
 
 
 def seen(obstacle: Solid, shape: Shape) -> dict[str, Any]:

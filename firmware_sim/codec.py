@@ -85,9 +85,7 @@ def encode_state(motor: int, err: int, q: float, qd: float, tau: float, temps: t
     """Return the 8 bytes [err<<4 | id] p16 | v12 | t12 | T_mos | T_rotor; temperatures in [degC], saturated to u8."""
     p, v, t = quantise(q, scale.p, 16), quantise(qd, scale.v, 12), quantise(tau, scale.t, 12)
     mos, rotor = (min(max(x, 0), 255) for x in temps)
-    return bytes(
-        (err << 4 | motor & 0xF, p >> 8, p & 0xFF, v >> 4, (v & 0xF) << 4 | t >> 8, t & 0xFF, mos, rotor)
-    )  # fmt: skip
+    return bytes((err << 4 | motor & 0xF, p >> 8, p & 0xFF, v >> 4, (v & 0xF) << 4 | t >> 8, t & 0xFF, mos, rotor))
 
 
 def decode_register(data: bytes) -> Register:

@@ -68,9 +68,16 @@ class Lidar:
         if self.mirrored:
             cells = [cells[-k] for k in range(SECTORS)]
         return self.end.codec.obstacle_distance_encode(
-            round(unix * 1e6), 0, cells, round(width), round(100.0 * NEAREST), round(100.0 * REACH), width, 0.0,
+            round(unix * 1e6),
+            0,
+            cells,
+            round(width),
+            round(100.0 * NEAREST),
+            round(100.0 * REACH),
+            width,
+            0.0,
             self.frame,
-        )  # fmt: skip
+        )
 
 
 def _within(angle: float, low: float, high: float) -> bool:

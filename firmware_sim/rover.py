@@ -93,9 +93,12 @@ class Rover:
         self.period = 1.0 / float(config["loop"]["servo_hz"])
         self.url = str(link["url"])
         traits = Traits(
-            base["wheels"], 1.05 * motion["v_max_m_s"], 1.05 * motion["w_max_rad_s"], 2.0,
+            base["wheels"],
+            1.05 * motion["v_max_m_s"],
+            1.05 * motion["w_max_rad_s"],
+            2.0,
             radius=float(base.get("turn_radius_m", 0.0)),
-        )  # fmt: skip
+        )
         self.vehicle = Vehicle(traits, *map(float, pose))
         system, key = int(link.get("vehicle_id") or 1), key_of(link, folder)
         gcs = int(link.get("system_id", 245))
@@ -103,8 +106,10 @@ class Rover:
         self.lidar = Lidar(Endpoint(system, COMPONENT, key), seed)
         self.outline, self.radius = _outline(base)
         self.tables = [*config.get("obstacle", ()), *obstacles]
-        still = [not (t.get("waypoints") or any(t.get("velocity_m_s", ())) or "appears_s" in t or "vanishes_s" in t)
-                 for t in self.tables]  # fmt: skip
+        still = [
+            not (t.get("waypoints") or any(t.get("velocity_m_s", ())) or "appears_s" in t or "vanishes_s" in t)
+            for t in self.tables
+        ]
         self._still = plane.solids_at([t for t, rests in zip(self.tables, still, strict=True) if rests], 0.0)
         self._moving = [t for t, rests in zip(self.tables, still, strict=True) if not rests]
         plane.solids_at(self._moving, 0.0)  # complains now, not later
@@ -264,10 +269,16 @@ def open_rover(
         with path.open("rb") as file:
             config = tomllib.load(file)
         faults = [
-            fault_at(t["kind"], float(t["at_s"]), t.get("duration_s"), KINDS,
-                     (float(t.get("from_deg", -180.0)), float(t.get("to_deg", 180.0))), float(t.get("value", math.nan)))
+            fault_at(
+                t["kind"],
+                float(t["at_s"]),
+                t.get("duration_s"),
+                KINDS,
+                (float(t.get("from_deg", -180.0)), float(t.get("to_deg", 180.0))),
+                float(t.get("value", math.nan)),
+            )
             for t in play.get("fault", ())
-        ]  # fmt: skip
+        ]
         faults += [parsed(text) for text in inject]
         start = play.get("start_pose") or (0.0, 0.0, 0.0)
         return Rover(config, path.parent, start, play.get("obstacle", ()), faults, wait, seed)

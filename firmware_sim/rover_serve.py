@@ -216,10 +216,20 @@ class Server:
     def _write(self) -> None:
         truth, pilot = self.rover.truth(), self.rover.autopilot
         content = {
-            "time_s": truth.time, "x_m": truth.x, "y_m": truth.y, "yaw_rad": truth.yaw, "v_m_s": truth.v,
-            "contacts": truth.contacts, "min_clearance_m": self.least, "armed": pilot.armed, "mode": pilot.mode,
-            "aborted": pilot.aborted, "refused": pilot.end.refused, "texts": pilot.log, "track": self.track,
-        }  # fmt: skip
+            "time_s": truth.time,
+            "x_m": truth.x,
+            "y_m": truth.y,
+            "yaw_rad": truth.yaw,
+            "v_m_s": truth.v,
+            "contacts": truth.contacts,
+            "min_clearance_m": self.least,
+            "armed": pilot.armed,
+            "mode": pilot.mode,
+            "aborted": pilot.aborted,
+            "refused": pilot.end.refused,
+            "texts": pilot.log,
+            "track": self.track,
+        }
         assert self.report is not None
         new = Path(self.report + ".new")
         new.write_text(json.dumps(content), encoding="utf-8")

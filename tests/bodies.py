@@ -115,8 +115,18 @@ def write_stl(path: Path, surface: Surface, ascii_: bool = False) -> Path:
     """Write a surface as an STL file, which knows no vertices in common."""
     p = surface.V[surface.T].astype("<f4")
     if ascii_:
-        facets = ["\n".join(["facet normal 0 0 0", "outer loop", *(f"vertex {x:.9g} {y:.9g} {z:.9g}" for x, y, z in t),
-                             "endloop", "endfacet"]) for t in p]  # fmt: skip
+        facets = [
+            "\n".join(
+                [
+                    "facet normal 0 0 0",
+                    "outer loop",
+                    *(f"vertex {x:.9g} {y:.9g} {z:.9g}" for x, y, z in t),
+                    "endloop",
+                    "endfacet",
+                ]
+            )
+            for t in p
+        ]
         path.write_text("solid it\n" + "\n".join(facets) + "\nendsolid it\n")
         return path
     rows = np.zeros(len(p), np.dtype([("n", "<f4", 3), ("v", "<f4", (3, 3)), ("rest", "<u2")]))

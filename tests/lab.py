@@ -90,9 +90,13 @@ class Run(NamedTuple):
         """Return the rows from time t [s] on."""
         k = int(np.searchsorted(self.t, t))
         return self._replace(
-            t=self.t[k:], q=self.q[k:], qd=self.qd[k:], tip=self.tip[k:], record=self.record[k:],
+            t=self.t[k:],
+            q=self.q[k:],
+            qd=self.qd[k:],
+            tip=self.tip[k:],
+            record=self.record[k:],
             requests=self.requests[k:],
-        )  # fmt: skip
+        )
 
 
 def play(scenario: dict[str, Any], path: Path = PANDA) -> Run:

@@ -87,8 +87,14 @@ class MavsdkVehicle:
                 self.intervals[name] = period
         else:
             result = 3
-        ack = {"command": command, "result": result, "progress": 0, "result_param2": 0,
-               "target_system": message.system_id, "target_component": message.component_id}  # fmt: skip
+        ack = {
+            "command": command,
+            "result": result,
+            "progress": 0,
+            "result_param2": 0,
+            "target_system": message.system_id,
+            "target_component": message.component_id,
+        }
         self._say(self._pilot, "COMMAND_ACK", ack)
         if command in (SET_MODE, ARM):
             self._due["HEARTBEAT"] = 0.0
@@ -98,8 +104,9 @@ class MavsdkVehicle:
         self.heard.append((message.message_name, fields))
         if message.message_name == "TIMESYNC" and fields["tc1"] == 0:
             now = round(1e9 * (time.monotonic() - self._began)) + 1
-            self._say(self._pilot, "TIMESYNC", {"tc1": now, "ts1": fields["ts1"], "target_system": 0,
-                                                "target_component": 0})  # fmt: skip
+            self._say(
+                self._pilot, "TIMESYNC", {"tc1": now, "ts1": fields["ts1"], "target_system": 0, "target_component": 0}
+            )
         elif message.message_name == "SET_POSITION_TARGET_LOCAL_NED":
             if self.mode == GUIDED and self.armed and fields["coordinate_frame"] == 8:
                 self.asked = (fields["vx"], fields["yaw_rate"])
@@ -122,15 +129,41 @@ class MavsdkVehicle:
         boot = round(1e3 * (now - self._began))
         north, east = self.v * math.cos(self.yaw), self.v * math.sin(self.yaw)
         told = {
-            "HEARTBEAT": {"type": 10, "autopilot": 3, "base_mode": 1 | (ARMED if self.armed else 0),
-                          "custom_mode": self.mode, "system_status": 4, "mavlink_version": 3},
-            "LOCAL_POSITION_NED": {"time_boot_ms": boot, "x": self.x, "y": self.y, "z": 0.0, "vx": north, "vy": east,
-                                   "vz": 0.0},
-            "ATTITUDE": {"time_boot_ms": boot, "roll": 0.0, "pitch": 0.0, "yaw": self.yaw, "rollspeed": 0.0,
-                         "pitchspeed": 0.0, "yawspeed": self.w},
-            "EKF_STATUS_REPORT": {"flags": 63, "velocity_variance": 0.1, "pos_horiz_variance": 0.1,
-                                  "pos_vert_variance": 0.1, "compass_variance": 0.1, "terrain_alt_variance": 0.0},
-        }  # fmt: skip
+            "HEARTBEAT": {
+                "type": 10,
+                "autopilot": 3,
+                "base_mode": 1 | (ARMED if self.armed else 0),
+                "custom_mode": self.mode,
+                "system_status": 4,
+                "mavlink_version": 3,
+            },
+            "LOCAL_POSITION_NED": {
+                "time_boot_ms": boot,
+                "x": self.x,
+                "y": self.y,
+                "z": 0.0,
+                "vx": north,
+                "vy": east,
+                "vz": 0.0,
+            },
+            "ATTITUDE": {
+                "time_boot_ms": boot,
+                "roll": 0.0,
+                "pitch": 0.0,
+                "yaw": self.yaw,
+                "rollspeed": 0.0,
+                "pitchspeed": 0.0,
+                "yawspeed": self.w,
+            },
+            "EKF_STATUS_REPORT": {
+                "flags": 63,
+                "velocity_variance": 0.1,
+                "pos_horiz_variance": 0.1,
+                "pos_vert_variance": 0.1,
+                "compass_variance": 0.1,
+                "terrain_alt_variance": 0.0,
+            },
+        }
         for name, fields in told.items():
             period = 1.0 if name == "HEARTBEAT" else self.intervals.get(name, 0.0)
             if period and now >= self._due.get(name, 0.0):
@@ -138,9 +171,17 @@ class MavsdkVehicle:
                 self._say(self._pilot, name, fields)
         if now >= self._due.get("scan", 0.0):
             self._due["scan"] = now + 0.1
-            scan = {"time_usec": round(1e6 * time.time()), "sensor_type": 0, "distances": [1201] * 72, "increment": 5,
-                    "min_distance": 20, "max_distance": 1200, "increment_f": 5.0, "angle_offset": 0.0,
-                    "frame": 12}  # fmt: skip
+            scan = {
+                "time_usec": round(1e6 * time.time()),
+                "sensor_type": 0,
+                "distances": [1201] * 72,
+                "increment": 5,
+                "min_distance": 20,
+                "max_distance": 1200,
+                "increment_f": 5.0,
+                "angle_offset": 0.0,
+                "frame": 12,
+            }
             self._say(self._sensor, "OBSTACLE_DISTANCE", scan)
 
     def _say(self, server: Any, name: str, fields: dict[str, Any]) -> None:

@@ -46,9 +46,12 @@ class Said(NamedTuple):
 torque = st.integers(0, 4095).map(lambda t: (0x8000 << 48 | 0x800 << 36 | t).to_bytes(8, "big"))
 servo = st.builds(  # gains that leave the torque within its bounds, at small angles
     lambda p, v, kp, kd, t: (p << 48 | v << 36 | kp << 24 | kd << 12 | t).to_bytes(8, "big"),
-    st.integers(0x7F00, 0x80FF), st.integers(0x700, 0x8FF), st.integers(0, 100), st.integers(0, 4095),
+    st.integers(0x7F00, 0x80FF),
+    st.integers(0x700, 0x8FF),
+    st.integers(0, 100),
+    st.integers(0, 4095),
     st.integers(0x780, 0x880),
-)  # fmt: skip
+)
 special = st.integers(0xFA, 0xFF).map(lambda code: b"\xff" * 7 + bytes((code,)))
 likely = st.sampled_from([codec.SPECIAL_HEAD + bytes((code,)) for code in (codec.ENABLE, codec.CLEAR, codec.DISABLE)])
 number = st.sampled_from((7, 8, 9, 10, 21, 22, 23, 35, 99))

@@ -253,8 +253,12 @@ def test_estimate_is_filterpys_on_the_same_model():
         oracle.predict()
         z, v, age = RANDOM.normal(1.0, 0.1, 2), RANDOM.normal(0.0, 0.1, 2), RANDOM.uniform(0.0, 0.1)
         e, _ = estimator.measured(e, z, v, age, noise)
-        R = np.diag([noise.position**2 + (0.5 * noise.acceleration * age**2) ** 2,
-                     noise.velocity**2 + (noise.acceleration * age) ** 2])  # fmt: skip
+        R = np.diag(
+            [
+                noise.position**2 + (0.5 * noise.acceleration * age**2) ** 2,
+                noise.velocity**2 + (noise.acceleration * age) ** 2,
+            ]
+        )
         oracle.update(np.array([z[0], v[0]]), R=R, H=np.array([[1.0, -age, 0.0], [0.0, 1.0, 1.0]]))
         np.testing.assert_allclose([e.x[0], e.v[0], e.b[0]], oracle.x, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(e.P, oracle.P, rtol=1e-9, atol=1e-15)

@@ -8,14 +8,36 @@ from rtctl.cli import missions, values
 from rtctl.errors import UsageError
 
 PLAN = {
-    "fileType": "Plan", "version": 1, "groundStation": "QGroundControl",
-    "mission": {"version": 2, "firmwareType": 3, "vehicleType": 10, "plannedHomePosition": [-35.0, 149.0, 584.0],
-                "items": [{"type": "SimpleItem", "autoContinue": True, "doJumpId": 1, "frame": 3, "command": 16,
-                           "params": [0, 2.5, 0, None, -35.36326, 149.16529, 0]},
-                          {"type": "SimpleItem", "autoContinue": True, "doJumpId": 2, "frame": 3, "command": 16,
-                           "params": [0, 0, 0, None, -35.36300, 149.16540, 0]}]},
-    "geoFence": {"circles": [], "polygons": [], "version": 2}, "rallyPoints": {"points": [], "version": 2},
-}  # fmt: skip
+    "fileType": "Plan",
+    "version": 1,
+    "groundStation": "QGroundControl",
+    "mission": {
+        "version": 2,
+        "firmwareType": 3,
+        "vehicleType": 10,
+        "plannedHomePosition": [-35.0, 149.0, 584.0],
+        "items": [
+            {
+                "type": "SimpleItem",
+                "autoContinue": True,
+                "doJumpId": 1,
+                "frame": 3,
+                "command": 16,
+                "params": [0, 2.5, 0, None, -35.36326, 149.16529, 0],
+            },
+            {
+                "type": "SimpleItem",
+                "autoContinue": True,
+                "doJumpId": 2,
+                "frame": 3,
+                "command": 16,
+                "params": [0, 0, 0, None, -35.36300, 149.16540, 0],
+            },
+        ],
+    },
+    "geoFence": {"circles": [], "polygons": [], "version": 2},
+    "rallyPoints": {"points": [], "version": 2},
+}
 LINES = """QGC WPL 110
 0\t1\t0\t16\t0\t0\t0\t0\t-35.0\t149.0\t584\t1
 1\t0\t3\t16\t0\t2.5\t0\t0\t-35.36326\t149.16529\t0\t1
@@ -52,7 +74,7 @@ def test_a_list_of_latitudes_and_longitudes_is_goals_too() -> None:
         (json.dumps(PLAN).replace('"params"', '"TransectStyleComplexItem"'), "no plan of simple items"),
         ('{"fileType": "Plan"}', "no plan of simple items"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_place_to_drive_to_is_refused_by_its_item(text: str, why: str) -> None:
     with pytest.raises(UsageError, match=why):
         missions.goals_of(text, "m")

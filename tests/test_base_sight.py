@@ -194,8 +194,10 @@ def test_a_frame_that_turns_with_or_against_the_vehicle_is_noticed_and_named(wro
 
 
 def test_a_right_frame_is_never_called_wrong_while_it_winds_through_solids():
-    solids = [{**DISC, "name": f"d{k}", "radius_m": 1.0, "position_m": [5.0 + 4.0 * k, (-1) ** k * 2.0, 0.0]}
-              for k in range(4)]  # fmt: skip
+    solids = [
+        {**DISC, "name": f"d{k}", "radius_m": 1.0, "position_m": [5.0 + 4.0 * k, (-1) ** k * 2.0, 0.0]}
+        for k in range(4)
+    ]
     lab = BaseLab(obstacles=solids).armed()
     assert lab.arrive(24.0, 0.0)
     assert "scan_wrong" not in lab.seen

@@ -56,8 +56,10 @@ def test_it_allows_its_link_and_nothing_else():
     assert keys["IPAddressAllow"] == ["localhost"]
     assert keys["SocketBindDeny"] == ["any"]
     ports = {allowed.removeprefix("udp:") for allowed in keys["SocketBindAllow"]}
-    shipped = {path.read_text().partition('url = "udpin:127.0.0.1:')[2].partition('"')[0]
-               for path in (ROVER, CONFIGS / "rover_px4.toml")}  # fmt: skip
+    shipped = {
+        path.read_text().partition('url = "udpin:127.0.0.1:')[2].partition('"')[0]
+        for path in (ROVER, CONFIGS / "rover_px4.toml")
+    }
     assert ports == shipped
     assert keys["DevicePolicy"] == ["closed"]
     lines = {device.split()[0] for device in keys["DeviceAllow"]}
@@ -108,9 +110,14 @@ def test_a_rover_starts_where_it_may_write_its_state_alone_and_has_no_capability
     ]
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(tmp_path)}
     child = subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path,
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        cwd=tmp_path,
         start_new_session=True,
-    )  # fmt: skip
+    )
     assert child.stdout is not None
     said = []
     try:

@@ -70,8 +70,14 @@ def test_loss_delay_and_reordering_slow_or_stop_it_but_never_cause_contact():
     ("start", "velocity"), [((12.0, 6.0), (0.0, -0.6)), ((12.0, 8.0), (0.0, -1.2)), ((25.0, 0.2), (-0.8, 0.0))]
 )
 def test_what_moves_across_or_towards_it_is_not_touched(start, velocity):
-    moving = {"name": "m", "type": "cylinder", "radius_m": 0.5, "length_m": 2.0, "position_m": [*start, 0.0],
-              "velocity_m_s": [*velocity, 0.0]}  # fmt: skip
+    moving = {
+        "name": "m",
+        "type": "cylinder",
+        "radius_m": 0.5,
+        "length_m": 2.0,
+        "position_m": [*start, 0.0],
+        "velocity_m_s": [*velocity, 0.0],
+    }
     lab = BaseLab(obstacles=[moving]).armed()
     assert lab.arrive(25.0, 0.0)
     assert lab.rover.truth().contacts == 0

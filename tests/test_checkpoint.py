@@ -104,9 +104,15 @@ def test_every_field_comes_back_to_the_bit_and_the_tick_goes_on_from_there():
 
 def test_none_is_made_while_a_cloud_is_known():
     cloud = Shape(
-        "cloud", "cloud", np.array([0.01, 1e-3, 0, 0]), np.array([0.0, 0, 9]), np.array([1.0, 0, 0, 0]),
-        np.zeros(3), np.zeros(3), cloud=bytes(600),
-    )  # fmt: skip
+        "cloud",
+        "cloud",
+        np.array([0.01, 1e-3, 0, 0]),
+        np.array([0.0, 0, 9]),
+        np.array([1.0, 0, 0, 0]),
+        np.zeros(3),
+        np.zeros(3),
+        cloud=bytes(600),
+    )
     arm = Standing()
     arm.tick(Request(obstacles=(ObstacleEdit("cloud", cloud),)))
     assert encode_checkpoint(arm.memory, ()) is None
@@ -225,15 +231,19 @@ def without_start(log: Path, cut: Path, start: int) -> None:
         found = reader.get_summary()
         assert found is not None
         for attachment in reader.iter_attachments():
-            writer.add_attachment(attachment.create_time, attachment.log_time, attachment.name,
-                                  attachment.media_type, attachment.data)  # fmt: skip
+            writer.add_attachment(
+                attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+            )
         for metadata in reader.iter_metadata():
             writer.add_metadata(metadata.name, metadata.metadata)
         schemas = {k: writer.register_schema(s.name, s.encoding, s.data) for k, s in found.schemas.items()}
-        ids = {k: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
-               for k, c in found.channels.items()}  # fmt: skip
+        ids = {
+            k: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+            for k, c in found.channels.items()
+        }
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if message.log_time >= start:
-                writer.add_message(ids[channel.id], message.log_time, message.data, message.publish_time,
-                                   message.sequence)  # fmt: skip
+                writer.add_message(
+                    ids[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                )
         writer.finish()

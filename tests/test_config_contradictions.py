@@ -176,9 +176,12 @@ def test_the_base_pose_moves_the_arm_and_what_it_reaches(panda: Robot, tmp_path:
 
 def test_the_paper_s_rates_are_accepted(tmp_path: Path) -> None:
     slow = edited(
-        ("loop.servo_hz", 225), ("loop.model_hz", 100), ("safety.watchdog_ms", 60.0),
-        ("safety.stale_hold_ms", 13.4), ("safety.stale_stop_ms", 45.0),
-    )  # fmt: skip
+        ("loop.servo_hz", 225),
+        ("loop.model_hz", 100),
+        ("safety.watchdog_ms", 60.0),
+        ("safety.stale_hold_ms", 13.4),
+        ("safety.stale_stop_ms", 45.0),
+    )
     file = write(tmp_path / "panda.toml", slow)
     robot = design.build(design.load(file), file)
     assert (robot.safety.stale_periods, robot.safety.lost_periods) == (3, 10)

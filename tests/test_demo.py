@@ -155,8 +155,13 @@ def test_what_does_not_start_is_told_in_one_line(tmp_path: Path) -> None:
     scenario = tmp_path / "scene.toml"
     scenario.write_text(SCENE.format(duration=1.0))
     command = [sys.executable, "-m", "tools.demo", "--lockstep", "--scenario", str(scenario), "--out", str(tmp_path)]
-    done = subprocess.run([*command, "--interface", "socketcan", "--channel", "none0"], capture_output=True, text=True,
-                          cwd=ROOT, check=False)  # fmt: skip
+    done = subprocess.run(
+        [*command, "--interface", "socketcan", "--channel", "none0"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert re.match(r"demo: drives ended with exit code 78: firmware_sim: none0: cannot be opened", done.stderr)
@@ -277,9 +282,13 @@ def outcome(reached: bool, missed: int = 0, slipped: float = 0.0) -> Outcome:
     ],
 )
 def test_lockstep_takes_over_only_where_the_machine_was_late(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, options: list[str], attempts: list[Outcome | str],
-    played: list[str], code: int,
-) -> None:  # fmt: skip
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    options: list[str],
+    attempts: list[Outcome | str],
+    played: list[str],
+    code: int,
+) -> None:
     modes: list[str] = []
     left = iter(attempts)
 

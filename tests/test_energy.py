@@ -20,9 +20,12 @@ CREATED = 0.02
 UNDAMPED = 1.07
 ZERO, UPRIGHT, EYE = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.eye(3)
 SHAPES = {
-    "sphere": (0.05, 0.0, 0.0, 0.0), "box": (0.05, 0.1, 0.1, 0.0), "ellipsoid": (0.05, 0.15, 0.1, 0.0),
-    "cone": (0.08, 0.02, 0.1, 0.0), "n_cylinder": (0.06, 0.1, 0.1, 4.0),
-}  # fmt: skip
+    "sphere": (0.05, 0.0, 0.0, 0.0),
+    "box": (0.05, 0.1, 0.1, 0.0),
+    "ellipsoid": (0.05, 0.15, 0.1, 0.0),
+    "cone": (0.08, 0.02, 0.1, 0.0),
+    "n_cylinder": (0.06, 0.1, 0.1, 4.0),
+}
 
 
 def potential(rho: float, p: FieldParams) -> float:

@@ -59,8 +59,24 @@ def mass(x: F64) -> Model:
     none = np.zeros(0)
     Lambda_inv = np.zeros((6, 6))
     Lambda_inv[:3, :3] = EYE
-    return Model(x, np.zeros(3), EYE, EYE, np.zeros(3), np.zeros(3), x, EYE, J, np.zeros(6), x[None], EYE[None],
-                 EYE[None], Lambda_inv, none, none)  # fmt: skip
+    return Model(
+        x,
+        np.zeros(3),
+        EYE,
+        EYE,
+        np.zeros(3),
+        np.zeros(3),
+        x,
+        EYE,
+        J,
+        np.zeros(6),
+        x[None],
+        EYE[None],
+        EYE[None],
+        Lambda_inv,
+        none,
+        none,
+    )
 
 
 class Flight(NamedTuple):
@@ -127,8 +143,11 @@ def test_the_shorter_way_around_is_taken():
 def test_a_pocket_is_given_up_in_bounded_time_after_both_sides():
     flight = fly(world(POCKET), 20.0)
     assert [p for p, q in zip(flight.phases[1:], flight.phases, strict=False) if p != q] == [
-        Phase.CHOOSING, Phase.FIRST, Phase.OTHER, Phase.GIVEN_UP,
-    ]  # fmt: skip
+        Phase.CHOOSING,
+        Phase.FIRST,
+        Phase.OTHER,
+        Phase.GIVEN_UP,
+    ]
     assert np.linalg.norm(flight.X[-1] - GOAL) > 0.3
     assert np.linalg.norm(flight.X[-1] - flight.X[-500]) < 1e-2  # back in the pocket, at rest
     assert clearance(POCKET, flight.X) > 0.015

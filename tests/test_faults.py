@@ -156,7 +156,7 @@ CASES = {
     "overspeed": Case(said({"qd": joint(0, 2.175 * 1.25)}), said({"qd": joint(0, 2.175 * 1.15)})),
     "innovation": Case(drifts(0.003, 30), jumps(*[2e-4, -2e-4] * 20)),
     "log_degraded": Case(flag(Link.LOG_DEGRADED)),
-}  # fmt: skip
+}
 
 
 def produced(name: str, arm: Arm) -> bool:

@@ -36,11 +36,12 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
         table = with_shape(table, k, shape)
     space = osc.operational_space(model.J, model.A_inv, model.Lambda_inv, np.eye(6), arm.motion)
     return law.evaluate_law(
-        arm, model, space, table,
-        law.Motion(
-            q, np.zeros(7), osc.Twist(ZERO, ZERO), osc.Twist(e, ZERO), osc.Twist(e, ZERO), q, 1.0, np.zeros(7)
-        ),
-    )  # fmt: skip
+        arm,
+        model,
+        space,
+        table,
+        law.Motion(q, np.zeros(7), osc.Twist(ZERO, ZERO), osc.Twist(e, ZERO), osc.Twist(e, ZERO), q, 1.0, np.zeros(7)),
+    )
 
 
 def interpreted(patch: Patch) -> None:
@@ -216,9 +217,14 @@ def segment_distances_are_right(measure: Callable[[Shape, F64], tuple[F64, F64]]
     for _ in range(40):
         wxyz = rng.normal(size=4)
         shape = Shape(
-            "bar", "capsule", np.array([0.05, rng.uniform(0.05, 0.5), 0.0, 0.0]), rng.uniform(-1, 1, 3),
-            wxyz / np.linalg.norm(wxyz), ZERO, ZERO,
-        )  # fmt: skip
+            "bar",
+            "capsule",
+            np.array([0.05, rng.uniform(0.05, 0.5), 0.0, 0.0]),
+            rng.uniform(-1, 1, 3),
+            wxyz / np.linalg.norm(wxyz),
+            ZERO,
+            ZERO,
+        )
         P = rng.uniform(-1.0, 1.0, (50, 3))
         w, x, y, z = shape.wxyz
         axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

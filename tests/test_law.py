@@ -148,11 +148,18 @@ def test_a_slow_start_bounds_what_joints_are_asked_for():
 def test_an_obstacle_of_any_kind_reaches_the_torque():
     x = model_at(PANDA_HOME, np.zeros(7)).x
     dims = {
-        "point": (0, 0, 0, 0), "segment": (0.0, 0.1, 0, 0), "sphere": (0.02, 0, 0, 0), "capsule": (0.02, 0.1, 0, 0),
-        "cylinder": (0.02, 0.02, 0, 0), "cone": (0.02, 0.01, 0.02, 0), "box": (0.02, 0.02, 0.02, 0),
-        "plane": (0, 0, 0, 0), "ellipsoid": (0.02, 0.03, 0.02, 0), "n_ellipsoid": (0.02, 0.03, 0.02, 4.0),
+        "point": (0, 0, 0, 0),
+        "segment": (0.0, 0.1, 0, 0),
+        "sphere": (0.02, 0, 0, 0),
+        "capsule": (0.02, 0.1, 0, 0),
+        "cylinder": (0.02, 0.02, 0, 0),
+        "cone": (0.02, 0.01, 0.02, 0),
+        "box": (0.02, 0.02, 0.02, 0),
+        "plane": (0, 0, 0, 0),
+        "ellipsoid": (0.02, 0.03, 0.02, 0),
+        "n_ellipsoid": (0.02, 0.03, 0.02, 4.0),
         "n_cylinder": (0.02, 0.02, 0.03, 4.0),
-    }  # fmt: skip
+    }
     for kind, size in dims.items():
         at = x + np.array([0.0, 0.0, -0.08])
         unit = np.array([1.0, 0.0, 0.0, 0.0])

@@ -225,8 +225,10 @@ def test_an_event_comes_back_as_it_was_put_and_is_told_as_a_foxglove_log(path: P
     assert evidence["q"] == q
     said = [(decoder(schema).FromString(m.data), m) for topic, schema, m in messages(path) if topic == "/log"]
     assert [(m.level, m.message) for m, _ in said] == [
-        (2, "operator: arm"), (2, f"goal: {GOAL.position.tolist()}"), (4, "fault: bus off"),
-    ]  # fmt: skip
+        (2, "operator: arm"),
+        (2, f"goal: {GOAL.position.tolist()}"),
+        (4, "fault: bus off"),
+    ]
     assert all(m.timestamp.seconds * 10**9 + m.timestamp.nanos == raw.log_time for m, raw in said)
 
 

@@ -15,8 +15,14 @@ from rtctl.log.read.info import info
 from rtctl.log.read.mend import LOSSLESS, mend
 from tests.mcap_conformance import CONTENTS, Content, suite
 
-COUNTS = {"NoData": 6, "OneMessage": 154, "OneSchemalessMessage": 74, "TenMessages": 154, "OneAttachment": 14,
-          "OneMetadata": 14}  # fmt: skip
+COUNTS = {
+    "NoData": 6,
+    "OneMessage": 154,
+    "OneSchemalessMessage": 74,
+    "TenMessages": 154,
+    "OneAttachment": 14,
+    "OneMetadata": 14,
+}
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +87,22 @@ def test_no_command_gives_a_traceback(
             continue
         out = str(tmp_path / "out")
         for arguments in (
-            ["info"], ["info", "--json"], ["doctor"], ["can"], ["mavlink"], ["tail", "--for", "0.01"], ["replay"],
-            ["export", "--topic", "example", "--out", f"{out}.csv"], ["export", "--out", f"{out}.tlog"],
-            ["export", "--topic", "example", "--out", f"{out}.parquet"], ["export", "--out", f"{out}.log"],
-            ["plot", "--list"], ["plot", "--out", f"{out}.png"], ["report", "--out", f"{out}.html"],
+            ["info"],
+            ["info", "--json"],
+            ["doctor"],
+            ["can"],
+            ["mavlink"],
+            ["tail", "--for", "0.01"],
+            ["replay"],
+            ["export", "--topic", "example", "--out", f"{out}.csv"],
+            ["export", "--out", f"{out}.tlog"],
+            ["export", "--topic", "example", "--out", f"{out}.parquet"],
+            ["export", "--out", f"{out}.log"],
+            ["plot", "--list"],
+            ["plot", "--out", f"{out}.png"],
+            ["report", "--out", f"{out}.html"],
             ["recover", "--out", f"{out}.mcap"],
-        ):  # fmt: skip
+        ):
             code = cli.main(["log", arguments[0], str(path), *arguments[1:]])
             said = capsys.readouterr()
             assert code in (EXIT_OK, EXIT_FAILED), (path.name, arguments)

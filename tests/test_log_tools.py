@@ -451,11 +451,19 @@ def test_tail_tells_events_and_states_and_stops_with_the_log(log: Path):
 
 
 VERBS = (
-    ["info"], ["doctor"], ["can"], ["mavlink"], ["replay"], ["report", "--out", "{out}.html"],
+    ["info"],
+    ["doctor"],
+    ["can"],
+    ["mavlink"],
+    ["replay"],
+    ["report", "--out", "{out}.html"],
     ["plot", "--out", "{out}.png"],
-    ["export", "--out", "{out}.csv"], ["export", "--out", "{out}.log"], ["export", "--out", "{out}.parquet"],
-    ["tail", "--for", "0.01"], ["diff", "{file}"],
-)  # fmt: skip
+    ["export", "--out", "{out}.csv"],
+    ["export", "--out", "{out}.log"],
+    ["export", "--out", "{out}.parquet"],
+    ["tail", "--for", "0.01"],
+    ["diff", "{file}"],
+)
 
 
 def verbs(path: Path, out: Path) -> None:

@@ -80,8 +80,10 @@ def test_a_chunk_that_says_it_is_huge_is_not_unpacked(tmp_path: Path, claim: int
     tracemalloc.stop()
     assert log.damaged == 4
     assert peak < 8 * MIB
-    assert finding(path, "checksums") == (False, f"0 of 4 chunks unpack and match, 0 messages; chunk: says {claim} "
-                                                 f"bytes, at most {limits.CHUNK} are unpacked")  # fmt: skip
+    assert finding(path, "checksums") == (
+        False,
+        f"0 of 4 chunks unpack and match, 0 messages; chunk: says {claim} bytes, at most {limits.CHUNK} are unpacked",
+    )
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
@@ -177,8 +179,10 @@ def test_a_record_of_any_size_up_to_the_bound_is_taken():
 
 def test_frames_of_zstd_or_lz4_one_behind_another_are_one_chunk(tmp_path: Path):
     first, second = message(0, 1), message(0, 2)
-    for name, packed in (("zstd", zstd(first) + zstd(second)),
-                         ("lz4", lz4.frame.compress(first) + lz4.frame.compress(second))):  # fmt: skip
+    for name, packed in (
+        ("zstd", zstd(first) + zstd(second)),
+        ("lz4", lz4.frame.compress(first) + lz4.frame.compress(second)),
+    ):
         path = file_of(tmp_path / f"{name}.mcap", chunk_of(first + second, packed, name))
         assert read(path)["/x"].time.tolist() == [1, 2]
         done = mend(path)

@@ -312,8 +312,11 @@ def test_a_mesh_is_told_by_the_name_that_the_config_gave_it(tmp_path: Path) -> N
     path = panda(tmp_path, mesh=[{"name": "ell", "file": "it.stl", "scale": 1.5}])
     arm = cfg.build(cfg.load(path), path)
     assert arm.meshes.names == ("ell",)
-    told = messages.decode(json.dumps({"verb": "obstacle", "set": {
-        "type": "mesh", "name": "crate", "mesh": "ell", "position_m": [2.0, 0.0, 0.0]}}).encode())  # fmt: skip
+    told = messages.decode(
+        json.dumps(
+            {"verb": "obstacle", "set": {"type": "mesh", "name": "crate", "mesh": "ell", "position_m": [2.0, 0.0, 0.0]}}
+        ).encode()
+    )
     table, refusal = obstacle_table.edited(
         obstacle_table.empty(4, arm.meshes), messages.request_of(told, BOUNDS, list).obstacles
     )
@@ -459,12 +462,23 @@ def test_the_plant_measures_a_mesh_and_a_cloud_as_the_shapes_they_stand_for(tmp_
     specs = [
         {"name": "mesh", "type": "mesh", "file": str(tmp_path / "box.obj"), "position_m": [0.75, 0.1, 0.6], **pose},
         {"name": "box", "type": "box", "size_m": [0.2, 0.1, 0.3], "position_m": [0.75, 0.1, 0.6], **pose},
-        {"name": "cloud", "type": "cloud", "file": str(tmp_path / "ball.npy"), "point_radius_m": 0.02,
-         "position_m": [0.5, -0.3, 0.5], **pose},
+        {
+            "name": "cloud",
+            "type": "cloud",
+            "file": str(tmp_path / "ball.npy"),
+            "point_radius_m": 0.02,
+            "position_m": [0.5, -0.3, 0.5],
+            **pose,
+        },
         {"name": "ball", "type": "sphere", "radius_m": 0.1, "position_m": [0.5, -0.3, 0.5]},
-        {"name": "on", "type": "cloud", "file": str(tmp_path / "ball.npy"), "point_radius_m": 0.02,
-         "position_m": [0.3, 0.0, 0.5]},
-    ]  # fmt: skip
+        {
+            "name": "on",
+            "type": "cloud",
+            "file": str(tmp_path / "ball.npy"),
+            "point_radius_m": 0.02,
+            "position_m": [0.3, 0.0, 0.5],
+        },
+    ]
     simulator = open_simulator(PANDA, {"obstacle": specs})
     try:
         truth = simulator.truth()
@@ -491,9 +505,15 @@ def test_the_simulated_camera_sends_what_the_daemon_reads(tmp_path: Path) -> Non
     specs = [
         {"name": "a", "type": "mesh", "mesh": "ell", "position_m": [1.0, 0.0, 0.5], "group": "g"},
         {"name": "b", "type": "mesh", "file": str(tmp_path / "ell.stl"), "position_m": [0.0, 1.0, 0.5]},
-        {"name": "c", "type": "cloud", "file": str(tmp_path / "dust.npy"), "point_radius_m": 0.01,
-         "position_m": [0.0, 0.0, 1.5], "omega_rad_s": [0.0, 0.0, 1.0]},
-    ]  # fmt: skip
+        {
+            "name": "c",
+            "type": "cloud",
+            "file": str(tmp_path / "dust.npy"),
+            "point_radius_m": 0.01,
+            "position_m": [0.0, 0.0, 1.5],
+            "omega_rad_s": [0.0, 0.0, 1.0],
+        },
+    ]
     simulator = open_simulator(path, {"obstacle": specs})
     sent: list[bytes] = []
     eye = simulated.Camera("nowhere", simulator.plant.solids)

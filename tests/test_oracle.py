@@ -33,13 +33,25 @@ def world(rng: np.random.Generator, size: float) -> list[dict[str, Any]]:
         {"name": "floor", "type": "plane", "position_m": [0.0, 0.0, -0.06]},
         {"name": "ball", "type": "sphere", "radius_m": 0.07, "waypoints": walk()},
         {"name": "crate", "type": "box", "size_m": [0.2, 0.1, 0.3], "position_m": place(), "rpy_rad": [0.3, 0.1, 1.0]},
-        {"name": "mill", "type": "box", "size_m": [0.6, 0.1, 0.05], "position_m": place(),
-         "omega_rad_s": [1.0, 2.0, 0.5]},
+        {
+            "name": "mill",
+            "type": "box",
+            "size_m": [0.6, 0.1, 0.05],
+            "position_m": place(),
+            "omega_rad_s": [1.0, 2.0, 0.5],
+        },
         {"name": "post", "type": "capsule", "radius_m": 0.04, "length_m": 0.5, "position_m": place(), "appears_s": 0.2},
         {"name": "guest", "type": "ellipsoid", "semi_axes_m": [0.1, 0.05, 0.2], "waypoints": walk(), "vanishes_s": 0.6},
-        {"name": "drift", "type": "cone", "radius_m": 0.1, "height_m": 0.3, "position_m": place(),
-         "velocity_m_s": [0.3, -0.2, 0.1], "omega_rad_s": [0.0, 0.0, 3.0]},
-    ]  # fmt: skip
+        {
+            "name": "drift",
+            "type": "cone",
+            "radius_m": 0.1,
+            "height_m": 0.3,
+            "position_m": place(),
+            "velocity_m_s": [0.3, -0.2, 0.1],
+            "omega_rad_s": [0.0, 0.0, 3.0],
+        },
+    ]
 
 
 def everything(plant: Plant) -> tuple[dict[str, float], float]:

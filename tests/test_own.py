@@ -67,12 +67,16 @@ def test_a_pair_is_left_out_only_where_gjk_finds_it_beyond_reach(reach: float) -
         true = np.array(
             [
                 coal.distance(
-                    every.hulls[i].shape, at[i], every.hulls[j].shape, at[j], coal.DistanceRequest(),
+                    every.hulls[i].shape,
+                    at[i],
+                    every.hulls[j].shape,
+                    at[j],
+                    coal.DistanceRequest(),
                     coal.DistanceResult(),
                 )
                 for i, j in every.pairs
             ]
-        )  # fmt: skip
+        )
         assert (every.distances(R, t) == np.where(true < reach, true, np.inf)).all()
         asked, within = asked + len(every.near(R, t)), within + int((true < reach).sum())
     assert 10 < within <= asked < 1.2 * within  # and few are measured for nothing

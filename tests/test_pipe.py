@@ -243,10 +243,20 @@ def test_the_record_tells_what_came_in_and_went_out():
     after, command, record = tick(robot(), memory, feedback._replace(lateness=1e-4, compute=2e-4), request)
     r = record[0]
     for name, value in (
-        ("q", feedback.q), ("qd", feedback.qd), ("tau_measured", feedback.tau), ("age", feedback.age),
-        ("slot", feedback.slot), ("lateness", 1e-4), ("compute", 2e-4), ("verb", Verb.STOP), ("tau_sent", command.tau),
-        ("command", command.drive), ("state", after.state), ("faults", after.in_force), ("tick", memory.tick + 1),
-    ):  # fmt: skip
+        ("q", feedback.q),
+        ("qd", feedback.qd),
+        ("tau_measured", feedback.tau),
+        ("age", feedback.age),
+        ("slot", feedback.slot),
+        ("lateness", 1e-4),
+        ("compute", 2e-4),
+        ("verb", Verb.STOP),
+        ("tau_sent", command.tau),
+        ("command", command.drive),
+        ("state", after.state),
+        ("faults", after.in_force),
+        ("tick", memory.tick + 1),
+    ):
         np.testing.assert_array_equal(r[name], value, err_msg=name)
     assert r["time"] == pytest.approx(feedback.slot * robot().dt)
     assert np.isfinite(r["rho"][:2]).all()

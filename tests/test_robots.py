@@ -283,14 +283,17 @@ def test_an_axis_along_which_the_arm_never_moves_is_refused(tmp_path: Path):
 
 # a goal, and an obstacle beside the way to it
 RUNS: dict[str, tuple[list[float], dict[str, Any]]] = {
-    "planar4": ([0.75, 1.15, 0], {"type": "cylinder", "radius_m": 0.05, "length_m": 0.4, "position_m": [0.98, 1.12, 0]}),  # noqa: E501
+    "planar4": (
+        [0.75, 1.15, 0],
+        {"type": "cylinder", "radius_m": 0.05, "length_m": 0.4, "position_m": [0.98, 1.12, 0]},
+    ),
     "puma560": ([0.58, 0.15, 1.05], {"type": "sphere", "radius_m": 0.06, "position_m": [0.72, 0.02, 1.12]}),
     "ur5": ([0.50, 0.35, 0.28], {"type": "box", "size_m": [0.08, 0.08, 0.3], "position_m": [0.66, 0.24, 0.2]}),
     "openarm": (
         [0.1, 0.32, 0.25],
         {"type": "capsule", "radius_m": 0.02, "length_m": 0.25, "position_m": [0.32, 0.26, 0.15]},
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", NAMES)

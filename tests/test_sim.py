@@ -110,9 +110,16 @@ def test_a_model_at_a_quarter_of_the_rate_makes_the_same_path(name: str, folder:
 
 def test_the_papers_rates_work_on_the_plain_protocol(folder: Path):
     path = changed(
-        folder, "paper", servo_hz=225, model_hz=100, watchdog_ms=50.0, stale_hold_ms=15.0, stale_stop_ms=50.0,
-        protocol='"mit"', fd="false",
-    )  # fmt: skip
+        folder,
+        "paper",
+        servo_hz=225,
+        model_hz=100,
+        watchdog_ms=50.0,
+        stale_hold_ms=15.0,
+        stale_stop_ms=50.0,
+        protocol='"mit"',
+        fd="false",
+    )
     path.write_text("".join(x for x in path.read_text().splitlines(True) if not x.startswith("data_bitrate")))
     for name in ("pose", "orientation held"):
         run = free(name, path)
@@ -147,7 +154,8 @@ HARD: dict[str, dict[str, Any]] = {
     "a goal inside": {"goal": to(0.5, 0.3, 0.4), "obstacle": [ball([0.5, 0.3, 0.42], 0.08)]},
     "a goal at the surface": {"goal": to(0.5, 0.3, 0.52), "obstacle": [ball([0.5, 0.3, 0.4], 0.1)]},
     "a goal that is swallowed": {
-        "goal": to(0.5, 0.3, 0.5), "obstacle": [ball([0.5, 0.9, 0.5], 0.12, velocity_m_s=[0.0, -0.4, 0.0])],
+        "goal": to(0.5, 0.3, 0.5),
+        "obstacle": [ball([0.5, 0.9, 0.5], 0.12, velocity_m_s=[0.0, -0.4, 0.0])],
     },
     "hardly out of reach": {"goal": to(0.0, 0.8, 0.9)},
     "hardly out of reach, held": {"goal": to(0.8, 0.3, 0.5, hold="orientation")},
@@ -158,11 +166,16 @@ HARD: dict[str, dict[str, Any]] = {
     "far out of reach": {"goal": to(3.0, 0.0, 0.3)},
     "inside its own base": {"goal": to(0.0, 0.0, 0.3)},
     "under its own base": {"goal": to(0.0, 0.0, -0.4)},
-}  # fmt: skip
+}
 REACHED = {
-    "stretched upright", "stretched out", "wrist in line", "past a limit", "inside an influence",
-    "nearer than the clearance", "elbow inside an influence",
-}  # fmt: skip
+    "stretched upright",
+    "stretched out",
+    "wrist in line",
+    "past a limit",
+    "inside an influence",
+    "nearer than the clearance",
+    "elbow inside an influence",
+}
 
 
 @cache
@@ -250,11 +263,28 @@ def test_a_goal_that_is_swallowed_is_given_up_while_it_is():
 # ---- the command
 
 KEYS = {
-    "arrived", "time_to_goal_s", "final_error_m", "final_error_rad", "path_length_m", "line_deviation_m",
-    "max_speed_m_s", "min_clearance_m", "min_self_clearance_m", "contacts", "min_joint_margin_rad", "max_torque_ratio",
-    "max_torque_rate_ratio", "max_joint_speed_ratio", "statuses", "mode_final", "faults", "ticks", "missed",
-    "realtime_factor", "digest",
-}  # fmt: skip
+    "arrived",
+    "time_to_goal_s",
+    "final_error_m",
+    "final_error_rad",
+    "path_length_m",
+    "line_deviation_m",
+    "max_speed_m_s",
+    "min_clearance_m",
+    "min_self_clearance_m",
+    "contacts",
+    "min_joint_margin_rad",
+    "max_torque_ratio",
+    "max_torque_rate_ratio",
+    "max_joint_speed_ratio",
+    "statuses",
+    "mode_final",
+    "faults",
+    "ticks",
+    "missed",
+    "realtime_factor",
+    "digest",
+}
 
 SCENARIO = f"""
 robot = "{PANDA}"

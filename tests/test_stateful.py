@@ -25,9 +25,7 @@ OPERATOR = (Verb.RESET, Verb.TERM)  # what may leave a latched state
 LATCHED = sum(1 << i for i, f in enumerate(FAULTS) if f.clear != "A")
 LATCHED_STATES = (State.SAFE_STOP, State.FAULT)
 
-number = st.one_of(
-    st.floats(-1.0, 1.0), st.sampled_from([math.nan, math.inf, -math.inf, 0.0, 1e300, -1e9, 5e-324])
-)  # fmt: skip
+number = st.one_of(st.floats(-1.0, 1.0), st.sampled_from([math.nan, math.inf, -math.inf, 0.0, 1e300, -1e9, 5e-324]))
 near = st.tuples(st.floats(0.2, 0.7), st.floats(-0.5, 0.5), st.floats(0.1, 0.8))
 anywhere = st.one_of(near, st.tuples(number, number, number))
 unit = st.sampled_from([(0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.5)])
@@ -155,13 +153,23 @@ class Session(RuleBasedStateMachine):
 
     @rule(
         kind=st.sampled_from(["sphere", "box", "capsule", "plane", "point", "n_ellipsoid", "cone", "cylinder", "blob"]),
-        at=anywhere, wxyz=turned, dims=sizes, velocity=st.tuples(number, number, number),
-        age=st.one_of(st.just(0.0), number), name=st.sampled_from(["a", "b", "c"]),
-    )  # fmt: skip
+        at=anywhere,
+        wxyz=turned,
+        dims=sizes,
+        velocity=st.tuples(number, number, number),
+        age=st.one_of(st.just(0.0), number),
+        name=st.sampled_from(["a", "b", "c"]),
+    )
     def an_obstacle_is_seen(
-        self, kind: str, at: tuple[float, ...], wxyz: tuple[float, ...], dims: tuple[float, ...],
-        velocity: tuple[float, ...], age: float, name: str,
-    ) -> None:  # fmt: skip
+        self,
+        kind: str,
+        at: tuple[float, ...],
+        wxyz: tuple[float, ...],
+        dims: tuple[float, ...],
+        velocity: tuple[float, ...],
+        age: float,
+        name: str,
+    ) -> None:
         d, p, o, v = (np.array(x, np.float64) for x in (dims, at, wxyz, velocity))
         shape = Shape(name, kind, d, p, o, v, np.zeros(3))
         self._step(Request(obstacles=(ObstacleEdit(name, shape, age),)))

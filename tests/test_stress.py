@@ -19,11 +19,33 @@ BRIEF = 2.0  # [s] that is played here of each
 def seen(**changes: Any) -> Seen:
     """Return what a run shows in which nothing is wrong."""
     good: dict[str, Any] = {
-        "robot": "panda", "case": 0, "duration": 5.0, "arrived": True, "error": 0.0, "contact": None, "retreat": 0.0,
-        "can_retreat": 0.0, "finite": True, "torque": 1.0, "rate": 1.0, "joint_speed": 1.0, "tip_speed": 1.0,
-        "margin": 0.0, "clearance": 0.1, "own": 0.1, "recent_torque": 0.1, "recent_speed": 0.1, "recent_tip": 0.1,
-        "stopped": "", "faults": (), "status": "arrived", "detail": "", "statuses": (), "diagnosis": "", "digest": "",
-    }  # fmt: skip
+        "robot": "panda",
+        "case": 0,
+        "duration": 5.0,
+        "arrived": True,
+        "error": 0.0,
+        "contact": None,
+        "retreat": 0.0,
+        "can_retreat": 0.0,
+        "finite": True,
+        "torque": 1.0,
+        "rate": 1.0,
+        "joint_speed": 1.0,
+        "tip_speed": 1.0,
+        "margin": 0.0,
+        "clearance": 0.1,
+        "own": 0.1,
+        "recent_torque": 0.1,
+        "recent_speed": 0.1,
+        "recent_tip": 0.1,
+        "stopped": "",
+        "faults": (),
+        "status": "arrived",
+        "detail": "",
+        "statuses": (),
+        "diagnosis": "",
+        "digest": "",
+    }
     return Seen(**(good | changes))
 
 

@@ -157,8 +157,10 @@ def test_each_link_carries_the_spheres_that_the_law_keeps_clear(arm_log: Path):
         for entity in (e for e in scene.entities if e.id.startswith("body ")):
             assert entity.frame_locked
             X = body.data.oMf[body.model.getFrameId(entity.frame_id)]
-            drawn += [[*X.act(np.array([s.pose.position.x, s.pose.position.y, s.pose.position.z])), s.size.x]
-                      for s in entity.spheres]  # fmt: skip
+            drawn += [
+                [*X.act(np.array([s.pose.position.x, s.pose.position.y, s.pose.position.z])), s.size.x]
+                for s in entity.spheres
+            ]
         joints = [body.data.oMi[int(link)] for link in points.link]
         wanted = [[*X.act(p), 2.0 * r] for X, p, r in zip(joints, points.local, points.radius, strict=True)]
         np.testing.assert_allclose(sorted(drawn), sorted(wanted), atol=1e-9)
@@ -185,8 +187,13 @@ def test_a_rovers_log_shows_it_where_it_was_with_its_goal_its_way_and_what_it_sa
             assert corners[0].x == pytest.approx(ticks.x[row, 0])
             if np.isfinite(ticks.way_length[row]):  # none is known while it looks for one
                 assert corners[-1].x == pytest.approx(40.0, abs=0.5)
-    seen = [(s.pose.position.x, s.pose.position.y) for _, _, m in scenes for e in m.entities if e.id == "scan"
-            for s in e.spheres]  # fmt: skip
+    seen = [
+        (s.pose.position.x, s.pose.position.y)
+        for _, _, m in scenes
+        for e in m.entities
+        if e.id == "scan"
+        for s in e.spheres
+    ]
     away = np.abs(np.hypot(*(np.array(seen) - (20.0, 0.0)).T) - 2.0)
     assert len(seen) > 100
     assert np.quantile(away, 0.9) < 0.3  # the scan is up to 0.1 s old: it moved and turned since
@@ -233,18 +240,31 @@ def test_meshes_and_clouds_are_drawn_as_boxes_that_hold_them_and_little_else():
         assert all(np.abs((c - centre) @ R).max() <= size for c, _, _ in map(corners_of, cubes))
 
 
-GOOD = {"type": "sphere", "dims": [0.1, 0, 0, 0], "position": [0, 0, 0], "wxyz": [1, 0, 0, 0],
-        "velocity": [0, 0, 0], "omega": [0, 0, 0]}  # fmt: skip
+GOOD = {
+    "type": "sphere",
+    "dims": [0.1, 0, 0, 0],
+    "position": [0, 0, 0],
+    "wxyz": [1, 0, 0, 0],
+    "velocity": [0, 0, 0],
+    "omega": [0, 0, 0],
+}
 
 
 @pytest.mark.parametrize(
     "edit",
     [
-        5, {"shape": 5}, {"shape": {}}, {"shape": GOOD, "age": "x"}, {"shape": GOOD, "age": None},
-        *({"shape": {**GOOD, name: value}} for name in ("dims", "position", "wxyz", "velocity", "omega")
-          for value in (None, "abc", [None] * 4, [0.0], [1e300] * 4)),
+        5,
+        {"shape": 5},
+        {"shape": {}},
+        {"shape": GOOD, "age": "x"},
+        {"shape": GOOD, "age": None},
+        *(
+            {"shape": {**GOOD, name: value}}
+            for name in ("dims", "position", "wxyz", "velocity", "omega")
+            for value in (None, "abc", [None] * 4, [0.0], [1e300] * 4)
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_request_that_no_table_would_take_is_not_drawn_and_takes_no_slot(edit: Any):
     scene = Scene(make_header("panda", robot().joints, 8, 1e-3))
     bad = {**edit, "name": "bad"} if isinstance(edit, dict) else edit

@@ -87,10 +87,15 @@ def test_edits_of_one_request_are_what_the_same_edits_one_by_one_are():
     part = sphere("part", [0.0, 0.0, 1.0], 0.1)._replace(group="union")
     start = advanced(put(empty(4, creep=0.1), ball, box._replace(name="old"), age=0.2), 0.05)
     edits = (
-        ObstacleEdit("ball", ball, 0.3), ObstacleEdit("box", box, 0.1, True), ObstacleEdit("old", None),
-        ObstacleEdit("ball", ball._replace(position=np.array([2.0, 0.0, 0.0]))), ObstacleEdit("part", part),
-        ObstacleEdit("box", None), ObstacleEdit("box", box._replace(group="union"), 0.2), ObstacleEdit("ghost", None),
-    )  # fmt: skip
+        ObstacleEdit("ball", ball, 0.3),
+        ObstacleEdit("box", box, 0.1, True),
+        ObstacleEdit("old", None),
+        ObstacleEdit("ball", ball._replace(position=np.array([2.0, 0.0, 0.0]))),
+        ObstacleEdit("part", part),
+        ObstacleEdit("box", None),
+        ObstacleEdit("box", box._replace(group="union"), 0.2),
+        ObstacleEdit("ghost", None),
+    )
     at_once, refusal = edited(start, edits)
     one_by_one = start
     for each in edits:

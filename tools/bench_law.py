@@ -22,9 +22,16 @@ BLOCK = 200  # calls between two turns: the call of the loop itself must not cou
 
 @leaf_kernel
 def _loop(
-    count: int, constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace,
-    obstacles: Obstacles, motion: Motion, work: tuple[WorkMemory, Outputs],
-) -> float:  # fmt: skip
+    count: int,
+    constants: Record,
+    cover: Cover,
+    seen: Field,
+    model: Model,
+    space: OperationalSpace,
+    obstacles: Obstacles,
+    motion: Motion,
+    work: tuple[WorkMemory, Outputs],
+) -> float:
     s = 0.0
     for _ in range(count):
         law(constants, cover, seen, model, space, obstacles, motion, work[0], work[1])

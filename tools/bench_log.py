@@ -90,7 +90,7 @@ def _recording(folder: Path, seconds: float) -> tuple[Path, list[Row]]:
         row("log", "wake-up with log", late[logged]),
         Row("log", "recorder, CPU per s of log", share, share, note=f"{1e-4 * share:.1f} % of a core, {lost}"),
         Row("log", "log size", None, None, note=f"{size / busy * 60 / 1e6:.1f} MB per minute, {stats.entries} entries"),
-    ]  # fmt: skip
+    ]
     return stats.path, rows
 
 

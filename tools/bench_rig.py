@@ -202,9 +202,15 @@ def case(robot: Robot, m: int, slots: int) -> Case:
     e, e_rot = np.array([0.1, 0.2, -0.05]), np.array([0.1, 0.0, 0.2])
     v_ref, w_ref = np.array([0.05, 0.05, 0.0]), np.array([0.1, 0.0, 0.1])
     motion = Motion(
-        q + 0.002, qd, Twist(twist[:3].copy(), twist[3:].copy()), Twist(e, e_rot), Twist(v_ref, w_ref), robot.q_rest,
-        1.0, np.zeros(robot.n),
-    )  # fmt: skip
+        q + 0.002,
+        qd,
+        Twist(twist[:3].copy(), twist[3:].copy()),
+        Twist(e, e_rot),
+        Twist(v_ref, w_ref),
+        robot.q_rest,
+        1.0,
+        np.zeros(robot.n),
+    )
     return Case(small, model, space, obstacles, motion)
 
 
@@ -259,19 +265,81 @@ class BoundFloor:
         self._arrays = [
             np.ascontiguousarray(each, np.float64)
             for each in (
-                q, qd, model.q, model.A, model.A_inv, model.h, model.g, model.J, model.Jdqd, space.Lambda, space.Jbar,
-                space.NT, model.P, model.Jp, model.B, r.points.radius, xd, omega, e, e_rot, v_ref, w_ref, q_rest, qdd,
-                r.q_min, r.q_max, r.qd_max, r.tau_max, r.tau_rate, r.braking, p.qdd_posture, b.rho0, b.rho_min,
-                b.rho_num, b.eta, b.k_d, obstacles.p, obstacles.v, obstacles.dims[:, 0],
+                q,
+                qd,
+                model.q,
+                model.A,
+                model.A_inv,
+                model.h,
+                model.g,
+                model.J,
+                model.Jdqd,
+                space.Lambda,
+                space.Jbar,
+                space.NT,
+                model.P,
+                model.Jp,
+                model.B,
+                r.points.radius,
+                xd,
+                omega,
+                e,
+                e_rot,
+                v_ref,
+                w_ref,
+                q_rest,
+                qdd,
+                r.q_min,
+                r.q_max,
+                r.qd_max,
+                r.tau_max,
+                r.tau_rate,
+                r.braking,
+                p.qdd_posture,
+                b.rho0,
+                b.rho_min,
+                b.rho_num,
+                b.eta,
+                b.k_d,
+                obstacles.p,
+                obstacles.v,
+                obstacles.dims[:, 0],
             )
-        ]  # fmt: skip
-        self._scalars = np.array([
-            p.k_p, p.k_v, p.v_max, p.a_max, p.w_max, p.alpha_max, p.speed_margin, p.k_q, p.d_q, a.rho0, a.rho_min,
-            a.rho_num, a.eta, a.k_d, a.look_ahead, a.v_smooth, a.m_max, r.dt, bounds.SPEED_BAND,
-            bounds.SPEED_HORIZON, scaling.SHARE_MIN, osc.SPEED_FLOOR, bounds.JERK_SHARE, bounds.TIP_SLOW,
-            nearby.APPROACH_ZONE, nearby.LINK_BAND, least_change.STEPS_MAX, least_change.ROWS_MAX,
-            least_change.SOFTNESS, least_change.TURNED,
-        ])  # fmt: skip
+        ]
+        self._scalars = np.array(
+            [
+                p.k_p,
+                p.k_v,
+                p.v_max,
+                p.a_max,
+                p.w_max,
+                p.alpha_max,
+                p.speed_margin,
+                p.k_q,
+                p.d_q,
+                a.rho0,
+                a.rho_min,
+                a.rho_num,
+                a.eta,
+                a.k_d,
+                a.look_ahead,
+                a.v_smooth,
+                a.m_max,
+                r.dt,
+                bounds.SPEED_BAND,
+                bounds.SPEED_HORIZON,
+                scaling.SHARE_MIN,
+                osc.SPEED_FLOOR,
+                bounds.JERK_SHARE,
+                bounds.TIP_SLOW,
+                nearby.APPROACH_ZONE,
+                nearby.LINK_BAND,
+                least_change.STEPS_MAX,
+                least_change.ROWS_MAX,
+                least_change.SOFTNESS,
+                least_change.TURNED,
+            ]
+        )
         self._link = r.points.link
         self._pointers = (ctypes.c_void_p * len(self._arrays))(*(each.ctypes.data for each in self._arrays))
         self._sizes = (r.n, len(r.points.radius), len(obstacles.active))

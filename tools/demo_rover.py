@@ -180,9 +180,15 @@ def _table(runs: Sequence[Run]) -> Table:
         time_, clear = WORLDS[run.world]
         reached = f"{run.time:.1f} s" if run.time is not None else "NOT REACHED"
         table.add_row(
-            run.world, reached, f"{run.clearance:.2f} m", str(run.contacts), ", ".join(run.faults) or "none",
-            str(run.packets), f"{time_:.1f} s", f"{clear:.2f} m",
-        )  # fmt: skip
+            run.world,
+            reached,
+            f"{run.clearance:.2f} m",
+            str(run.contacts),
+            ", ".join(run.faults) or "none",
+            str(run.packets),
+            f"{time_:.1f} s",
+            f"{clear:.2f} m",
+        )
     return table
 
 

@@ -82,9 +82,14 @@ class Outcome(NamedTuple):
 
 
 def judge(
-    trace: Trace, report: Mapping[str, Any], given: Sequence[Given], count: int, end: int, ended: str,
+    trace: Trace,
+    report: Mapping[str, Any],
+    given: Sequence[Given],
+    count: int,
+    end: int,
+    ended: str,
     exits: Mapping[str, int],
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Return the outcome of a run: `count` goals in its scenario, those `given`, over at the slot `end`."""
     accepted = [g for g in given if not g.refusal]
     stops = dict(zip(accepted, [g.slot for g in accepted[1:]] + [end], strict=True))

@@ -99,9 +99,8 @@ def sight(runs: int) -> Iterator[Case]:
         heading = float(random.uniform(-HEADING, HEADING))
         pose = (SIGHT_START, float(random.uniform(-1.0, 1.0)), heading)
         yield Case(
-            kind, name,
-            replaced(of_world(name), seed=seed, start_pose=pose, fault=(fault,), duration_s=SIGHT_DURATION),
-        )  # fmt: skip
+            kind, name, replaced(of_world(name), seed=seed, start_pose=pose, fault=(fault,), duration_s=SIGHT_DURATION)
+        )
 
 
 def bias(seeds: int) -> Iterator[Case]:
@@ -111,9 +110,12 @@ def bias(seeds: int) -> Iterator[Case]:
             angle = float(np.random.default_rng([3, seed]).uniform(-HEADING, HEADING))
             goal = TimedGoal(at_s=0.5, position_m=(6.0 * math.cos(angle), 6.0 * math.sin(angle), 0.0))
             play = replaced(
-                of_world("disc"), seed=seed, goal=(goal,), duration_s=12.0,
+                of_world("disc"),
+                seed=seed,
+                goal=(goal,),
+                duration_s=12.0,
                 fault=(FaultTable(at_s=0.0, kind="speed_bias", value=much),),
-            )  # fmt: skip
+            )
             yield Case(f"bias {much:g}", "disc", play)
 
 
@@ -142,10 +144,18 @@ def played(case: Case) -> Run:
     near = track[away <= NEAR, 0]
     says = "arrived" if any(name == "arrived" for name, _ in said) else ""
     run = Run(
-        case.kind, case.world, scenario.seed, False, says == "arrived", float(near[0]) - given if len(near) else None,
-        found["time_to_goal_s"], found["min_clearance_m"]["all"], found["contacts"], float(away[-1]),
+        case.kind,
+        case.world,
+        scenario.seed,
+        False,
+        says == "arrived",
+        float(near[0]) - given if len(near) else None,
+        found["time_to_goal_s"],
+        found["min_clearance_m"]["all"],
+        found["contacts"],
+        float(away[-1]),
         "; ".join([last, *found["faults"]]),
-    )  # fmt: skip
+    )
     moves = float(np.abs(track[-50:, 3]).max()) > 0.1
     return run._replace(fine=judged(run, bool(said) or bool(found["faults"]) or moves))
 

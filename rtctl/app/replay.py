@@ -145,10 +145,17 @@ def replay(run: Run, config: Path | None = None, progress: Callable[[int], None]
     seconds, ticks = time.perf_counter() - begun, sum(part.ticks for part in done)
     full = [part for part in done if part.ticks]
     return Replay(
-        log.robot.name, ticks, sum(part.frames for part in done), "" if log.wire is None else digest.hexdigest(),
-        done[0].divergence, done[0].differences, done[0].ignored, seconds, ticks * log.robot.dt,
+        log.robot.name,
+        ticks,
+        sum(part.frames for part in done),
+        "" if log.wire is None else digest.hexdigest(),
+        done[0].divergence,
+        done[0].differences,
+        done[0].ignored,
+        seconds,
+        ticks * log.robot.dt,
         *(np.concatenate([getattr(part, name) for part in full]) for name in ("time", "logged", "replayed")),
-    )  # fmt: skip
+    )
 
 
 def _first_tick(run: Run) -> int:
@@ -214,9 +221,15 @@ def _span(k: int) -> _Part | None:
 
 
 def _played(
-    run: Run, subject: _Subject[R, M, F, C], span: tuple[int, int], begin: _Mark | None, compares: bool,
-    sent_on: Callable[[bytes], None], progress: Callable[[int], None], end: _Mark | None = None,
-) -> _Part:  # fmt: skip
+    run: Run,
+    subject: _Subject[R, M, F, C],
+    span: tuple[int, int],
+    begin: _Mark | None,
+    compares: bool,
+    sent_on: Callable[[bytes], None],
+    progress: Callable[[int], None],
+    end: _Mark | None = None,
+) -> _Part:
     """Replay the ticks of a span of log_time, from a checkpoint or from the very start, up to one or the very end."""
     log, robot, tick, memory, expected = subject.log, subject.log.robot, subject.vehicle.tick, subject.memory, 0
     wire = None if log.wire is None else Wire(run, log.wire, compares, span)

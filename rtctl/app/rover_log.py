@@ -33,10 +33,15 @@ def header_of(config: BaseConfig, path: Path, base: Base, start: BaseFeedback, *
     if packed := archive("", path.parent, (), files_named(config), path.resolve().parent):
         files[MESHES] = packed
     header = make_header(
-        base.name, (), base.slots, base.dt, config=path.read_text(encoding="utf-8"), buses=(),
+        base.name,
+        (),
+        base.slots,
+        base.dt,
+        config=path.read_text(encoding="utf-8"),
+        buses=(),
         extra={"pose_handshake": pose.tobytes().hex(), "kind": "base", "start": first, **extra},
         files=files,
-    )  # fmt: skip
+    )
     return header._replace(dtype=base_dtype(base.slots), links=(LINK,))
 
 

@@ -29,11 +29,35 @@ from rtctl.types import B1, F64, I64
 
 @kernel
 def notice(
-    noted: F64, active: bool, q: F64, qd: F64, tau: F64, age: F64, replies: I64, drive: I64,
-    sent: F64, q_previous: F64, age_previous: F64, qdd: F64, A: F64, rho: F64, goal_rho: F64, seen_ago: F64, moving: B1,
-    torque_tolerance: F64, friction: F64, velocity_tolerance: F64, limit_tolerance: float, speed_tolerance: float,
-    rest_speed: float, q_min: F64, q_max: F64, qd_max: F64, elapsed: float, dt: float,
-) -> tuple[F64, float, float, int]:  # fmt: skip
+    noted: F64,
+    active: bool,
+    q: F64,
+    qd: F64,
+    tau: F64,
+    age: F64,
+    replies: I64,
+    drive: I64,
+    sent: F64,
+    q_previous: F64,
+    age_previous: F64,
+    qdd: F64,
+    A: F64,
+    rho: F64,
+    goal_rho: F64,
+    seen_ago: F64,
+    moving: B1,
+    torque_tolerance: F64,
+    friction: F64,
+    velocity_tolerance: F64,
+    limit_tolerance: float,
+    speed_tolerance: float,
+    rest_speed: float,
+    q_min: F64,
+    q_max: F64,
+    qd_max: F64,
+    elapsed: float,
+    dt: float,
+) -> tuple[F64, float, float, int]:
     """Return the watch (5, n) on the encoders, the greatest age [s] of a reply and of a moving obstacle, and the flags.
 
     noted, q to replies, q_previous to A, friction, velocity_tolerance, elapsed, dt: of `watch.watched`, which looks

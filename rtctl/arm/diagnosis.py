@@ -79,13 +79,31 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
     )
     obstacles, limits, own, granted = _shares(
-        _drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda, m.model.Jp, robot.points.link, robot.scratch,
-        tau_own, m.tau_obstacles, tau_limits, m.joints.q, robot.q_min, robot.q_max, robot.limit.rho0,
-    )  # fmt: skip
+        _drive(robot, m),
+        m.model.J,
+        m.model.A_inv,
+        m.space.Lambda,
+        m.model.Jp,
+        robot.points.link,
+        robot.scratch,
+        tau_own,
+        m.tau_obstacles,
+        tau_limits,
+        m.joints.q,
+        robot.q_min,
+        robot.q_max,
+        robot.limit.rho0,
+    )
     return Balance(
-        obstacles, limits, own, granted, np.abs(tau_wanted) / robot.tau_max, m.goal_rho, robot.avoid.rho0,
+        obstacles,
+        limits,
+        own,
+        granted,
+        np.abs(tau_wanted) / robot.tau_max,
+        m.goal_rho,
+        robot.avoid.rho0,
         norm(e) > m.goal.tolerance and at_edge(m.model.J, e),
-    )  # fmt: skip
+    )
 
 
 def _drive(robot: Robot, m: Memory) -> F64:
@@ -97,9 +115,21 @@ def _drive(robot: Robot, m: Memory) -> F64:
 
 @kernel
 def _shares(
-    F: F64, J: F64, A_inv: F64, Lambda: F64, Jp: F64, link: I64, field: Field, tau_own: F64,
-    tau_obstacles: F64, tau_limits: F64, q: F64, q_min: F64, q_max: F64, zone: F64,
-) -> tuple[F64, F64, float, float]:  # fmt: skip
+    F: F64,
+    J: F64,
+    A_inv: F64,
+    Lambda: F64,
+    Jp: F64,
+    link: I64,
+    field: Field,
+    tau_own: F64,
+    tau_obstacles: F64,
+    tau_limits: F64,
+    q: F64,
+    q_min: F64,
+    q_max: F64,
+    zone: F64,
+) -> tuple[F64, F64, float, float]:
     """Return the fields of `Balance` from `obstacles` to `granted`."""
     n, slots = q.shape[0], field.leader.shape[0]
     tau_m = tmatvec(J, matvec(Lambda, F))

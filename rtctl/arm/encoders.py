@@ -33,9 +33,20 @@ def fresh(n: int) -> F64:
 
 @kernel
 def watched(
-    before: F64, q: F64, qd: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qdd: F64, A: F64,
-    friction: F64, bound: F64, elapsed: float, dt: float,
-) -> tuple[F64, bool, bool]:  # fmt: skip
+    before: F64,
+    q: F64,
+    qd: F64,
+    age: F64,
+    replies: I64,
+    q_previous: F64,
+    age_previous: F64,
+    qdd: F64,
+    A: F64,
+    friction: F64,
+    bound: F64,
+    elapsed: float,
+    dt: float,
+) -> tuple[F64, bool, bool]:
     """Return the watch after a tick, whether an encoder is stuck, and whether position and speed of one disagree.
 
     q [rad], qd [rad/s], age [s], replies (n,) of the feedback, q_previous [rad] and age_previous [s] of the one before,

@@ -172,9 +172,18 @@ def correct(P: Covariance, h0: float, h1: float, r: float) -> tuple[float, float
 
 @kernel
 def _predict(
-    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
-    a: F64, alpha: F64, dt: float, sigma_a: float, sigma_alpha: float,
-) -> tuple[F64, F64, F64, F64, F64, F64]:  # fmt: skip
+    x: F64,
+    xd: F64,
+    P: F64,
+    R: F64,
+    omega: F64,
+    P_rot: F64,
+    a: F64,
+    alpha: F64,
+    dt: float,
+    sigma_a: float,
+    sigma_alpha: float,
+) -> tuple[F64, F64, F64, F64, F64, F64]:
     x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         x1[i] = x[i] + dt * (xd[i] + 0.5 * dt * a[i])
@@ -188,9 +197,17 @@ def _predict(
 
 @kernel
 def _update_velocity(
-    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
-    xd_measured: F64, omega_measured: F64, r_v: float, r_omega: float,
-) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
+    x: F64,
+    xd: F64,
+    P: F64,
+    R: F64,
+    omega: F64,
+    P_rot: F64,
+    xd_measured: F64,
+    omega_measured: F64,
+    r_v: float,
+    r_omega: float,
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:
     S, k0, k1, P1 = correct(covariance(P), 0.0, 1.0, r_v)
     S_rot, l0, l1, P_rot1 = correct(covariance(P_rot), 0.0, 1.0, r_omega)
     x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -206,9 +223,18 @@ def _update_velocity(
 
 @kernel
 def _update_pose(
-    x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64,
-    x_measured: F64, R_measured: F64, age: float, r_x: float, r_rot: float,
-) -> tuple[F64, F64, F64, F64, F64, F64, float]:  # fmt: skip
+    x: F64,
+    xd: F64,
+    P: F64,
+    R: F64,
+    omega: F64,
+    P_rot: F64,
+    x_measured: F64,
+    R_measured: F64,
+    age: float,
+    r_x: float,
+    r_rot: float,
+) -> tuple[F64, F64, F64, F64, F64, F64, float]:
     S, k0, k1, P1 = correct(covariance(P), 1.0, -age, r_x)
     S_rot, l0, l1, P_rot1 = correct(covariance(P_rot), 1.0, -age, r_rot)
     x1, xd1, omega1, turn = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -227,9 +253,20 @@ def _update_pose(
 
 @kernel
 def filter_joints(
-    q: F64, qd: F64, P: F64, qdd: F64, q_measured: F64, qd_measured: F64, age: F64, replies: I64 | B1, dt: float,
-    sigma_qdd: F64, r_q: F64, r_qd: F64, has_qd: bool,
-) -> tuple[F64, F64, F64, F64]:  # fmt: skip
+    q: F64,
+    qd: F64,
+    P: F64,
+    qdd: F64,
+    q_measured: F64,
+    qd_measured: F64,
+    age: F64,
+    replies: I64 | B1,
+    dt: float,
+    sigma_qdd: F64,
+    r_q: F64,
+    r_qd: F64,
+    has_qd: bool,
+) -> tuple[F64, F64, F64, F64]:
     n = q.shape[0]
     q1, qd1, P1, innovation = np.empty(n), np.empty(n), np.empty((n, 2, 2)), np.zeros(n)
     for i in range(n):
@@ -255,7 +292,7 @@ def filter_joints(
 @kernel
 def predict_tip(
     x: F64, xd: F64, P: F64, R: F64, omega: F64, P_rot: F64, J: F64, Jdqd: F64, qdd: F64, dt: float, p: EstimatorParams
-) -> tuple[F64, F64, F64, F64, F64, F64]:  # fmt: skip
+) -> tuple[F64, F64, F64, F64, F64, F64]:
     """Return the fields of a TipEstimate dt [s] later, by the acceleration J qdd + Jdqd."""
     a = matvec(J, qdd) + Jdqd
     return _predict(x, xd, P, R, omega, P_rot, a[:3], a[3:], dt, p.sigma_a, p.sigma_alpha)

@@ -70,11 +70,23 @@ def model_in(p: F64, n: int, m: int) -> tuple[Model, OperationalSpace]:
     Jp = NT + n * n
     B = Jp + 3 * m * n
     model = Model(
-        p[2 : 2 + n], p[2 + n : 2 + 2 * n], p[A:A_inv].reshape(n, n), p[A_inv:R].reshape(n, n),
-        p[2 + 2 * n : 2 + 3 * n], p[2 + 3 * n : a], p[a : a + 3], p[R:J].reshape(3, 3), p[J:P].reshape(6, n),
-        p[a + 3 : rho], p[P:Lambda_inv].reshape(m, 3), p[Jp:B].reshape(m, 3, n), p[B : B + 9 * m].reshape(m, 3, 3),
-        p[Lambda_inv:row].reshape(6, 6), p[rho:A], p[row:Lambda].reshape(pairs, n),
-    )  # fmt: skip
+        p[2 : 2 + n],
+        p[2 + n : 2 + 2 * n],
+        p[A:A_inv].reshape(n, n),
+        p[A_inv:R].reshape(n, n),
+        p[2 + 2 * n : 2 + 3 * n],
+        p[2 + 3 * n : a],
+        p[a : a + 3],
+        p[R:J].reshape(3, 3),
+        p[J:P].reshape(6, n),
+        p[a + 3 : rho],
+        p[P:Lambda_inv].reshape(m, 3),
+        p[Jp:B].reshape(m, 3, n),
+        p[B : B + 9 * m].reshape(m, 3, 3),
+        p[Lambda_inv:row].reshape(6, 6),
+        p[rho:A],
+        p[row:Lambda].reshape(pairs, n),
+    )
     space = OperationalSpace(
         p[Lambda:Jbar].reshape(6, 6), p[Jbar:NT].reshape(n, 6), p[NT:Jp].reshape(n, n), p[0], p[1] != 0.0
     )
@@ -118,10 +130,18 @@ def obstacles_in(t: F64, shapes: F64, bodies: BODIES) -> tuple[Obstacles, B1]:
         active[k], moving[k] = shapes[slots + k] != 0.0, shapes[2 * slots + k] != 0.0
     v, w, dims = shapes[4 * slots : 7 * slots], shapes[7 * slots : 10 * slots], shapes[10 * slots : 15 * slots]
     return Obstacles(
-        kind, active, t[3 * slots : 12 * slots].reshape(slots, 3, 3), t[: 3 * slots].reshape(slots, 3),
-        v.reshape(slots, 3), w.reshape(slots, 3), dims.reshape(slots, 5), group, t[12 * slots : 13 * slots],
-        bodies[0], bodies[1],
-    ), moving  # fmt: skip
+        kind,
+        active,
+        t[3 * slots : 12 * slots].reshape(slots, 3, 3),
+        t[: 3 * slots].reshape(slots, 3),
+        v.reshape(slots, 3),
+        w.reshape(slots, 3),
+        dims.reshape(slots, 5),
+        group,
+        t[12 * slots : 13 * slots],
+        bodies[0],
+        bodies[1],
+    ), moving
 
 
 @kernel
@@ -141,11 +161,17 @@ def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
     b = a + 6 * slots * m
     c = b + 15 * m
     return Field(
-        reals[:n], reals[n : n + slots], wholes[:slots], reals[n + slots : a].reshape(slots, 3),
-        reals[a:b].reshape(slots, 6, m), reals[b:c].reshape(15, m),
-        reals[c : c + slots * (n + 1)].reshape(slots, n + 1), wholes[slots : 2 * slots],
-        wholes[3 * slots : (3 + m) * slots].reshape(slots, m), wholes[2 * slots : 3 * slots],
-    )  # fmt: skip
+        reals[:n],
+        reals[n : n + slots],
+        wholes[:slots],
+        reals[n + slots : a].reshape(slots, 3),
+        reals[a:b].reshape(slots, 6, m),
+        reals[b:c].reshape(15, m),
+        reals[c : c + slots * (n + 1)].reshape(slots, n + 1),
+        wholes[slots : 2 * slots],
+        wholes[3 * slots : (3 + m) * slots].reshape(slots, m),
+        wholes[2 * slots : 3 * slots],
+    )
 
 
 def field_sizes(slots: int, m: int, n: int) -> tuple[int, int]:

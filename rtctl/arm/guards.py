@@ -155,7 +155,7 @@ def let_pass(inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: N
 @leaf_kernel
 def hold_back(
     s: Rows, inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: Nearby, made: I64, work: F64
-) -> bool:  # fmt: skip
+) -> bool:
     """Write what of tau (n,) [Nm] may be sent into work[0] (2, n), and return whether any guard acted.
 
     Least change in A's norm: min (qdd - A^-1 tau)^T A (qdd - A^-1 tau) with low <= qdd <= high, rows qdd <= most, and

@@ -202,9 +202,19 @@ def prepared(robot: Robot) -> Robot:
 def motion_params(c: Any) -> MotionParams:
     """Return the parameters of the motion task in the record c; what it has of joints is padded."""
     return MotionParams(
-        c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max, c.motion_k_q,
-        c.motion_d_q, c.motion_qdd_posture, c.motion_epsilon, c.motion_length, c.motion_speed_margin,
-    )  # fmt: skip
+        c.motion_k_p,
+        c.motion_k_v,
+        c.motion_v_max,
+        c.motion_a_max,
+        c.motion_w_max,
+        c.motion_alpha_max,
+        c.motion_k_q,
+        c.motion_d_q,
+        c.motion_qdd_posture,
+        c.motion_epsilon,
+        c.motion_length,
+        c.motion_speed_margin,
+    )
 
 
 class _Params(NamedTuple):
@@ -222,23 +232,48 @@ def _params(c: Any, n: int) -> _Params:
     """Return the parameters of n joints in the record c."""
     return _Params(
         MotionParams(
-            c.motion_k_p, c.motion_k_v, c.motion_v_max, c.motion_a_max, c.motion_w_max, c.motion_alpha_max,
-            c.motion_k_q, c.motion_d_q, c.motion_qdd_posture[:n], c.motion_epsilon, c.motion_length,
+            c.motion_k_p,
+            c.motion_k_v,
+            c.motion_v_max,
+            c.motion_a_max,
+            c.motion_w_max,
+            c.motion_alpha_max,
+            c.motion_k_q,
+            c.motion_d_q,
+            c.motion_qdd_posture[:n],
+            c.motion_epsilon,
+            c.motion_length,
             c.motion_speed_margin,
         ),
         FieldParams(
-            c.avoid_rho0, c.avoid_rho_min, c.avoid_rho_num, c.avoid_eta, c.avoid_k_d, c.avoid_look_ahead,
-            c.avoid_v_smooth, c.avoid_m_max,
+            c.avoid_rho0,
+            c.avoid_rho_min,
+            c.avoid_rho_num,
+            c.avoid_eta,
+            c.avoid_k_d,
+            c.avoid_look_ahead,
+            c.avoid_v_smooth,
+            c.avoid_m_max,
         ),
         FieldParams(
-            c.own_rho0, c.own_rho_min, c.own_rho_num, c.own_eta, c.own_k_d, c.own_look_ahead, c.own_v_smooth,
+            c.own_rho0,
+            c.own_rho_min,
+            c.own_rho_num,
+            c.own_eta,
+            c.own_k_d,
+            c.own_look_ahead,
+            c.own_v_smooth,
             c.own_m_max,
         ),
         LimitParams(
-            c.limit_rho0[:n], c.limit_rho_min[:n], c.limit_rho_num[:n], c.limit_eta[:n], c.limit_k_d[:n],
+            c.limit_rho0[:n],
+            c.limit_rho_min[:n],
+            c.limit_rho_num[:n],
+            c.limit_eta[:n],
+            c.limit_k_d[:n],
         ),
         c.dt,
-    )  # fmt: skip
+    )
 
 
 @leaf_kernel
@@ -313,17 +348,27 @@ def _work_in(memory: WorkMemory, slots: int, m: int, n: int, pairs: int) -> _Wor
     made = b + 3 * c + 1
     end = made + 2 * n + known
     return _Work(
-        memory.reals[a:most].reshape(_ROWS + known, n), memory.reals[most:real], memory.reals[real:rows],
-        memory.wholes[b:made], memory.wholes[made:end],
+        memory.reals[a:most].reshape(_ROWS + known, n),
+        memory.reals[most:real],
+        memory.reals[real:rows],
+        memory.wholes[b:made],
+        memory.wholes[made:end],
         rows_in(memory.reals[rows:], memory.wholes[end:], n),
-    )  # fmt: skip
+    )
 
 
 @leaf_kernel
 def _torques(
-    constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace, obstacles: Obstacles,
-    motion: Motion, task: F64, w: F64,
-) -> tuple[float, int, float]:  # fmt: skip
+    constants: Record,
+    cover: Cover,
+    seen: Field,
+    model: Model,
+    space: OperationalSpace,
+    obstacles: Obstacles,
+    motion: Motion,
+    task: F64,
+    w: F64,
+) -> tuple[float, int, float]:
     """Write the torques of the law without the guards into rows of w, and F, v_ref, w_ref into task (12,).
 
     Returns the least distance between links [m], the flags of the field, and the share of what drives.
@@ -397,9 +442,7 @@ def _let_pass(constants: Record, cover: Cover, seen: Field, model: Model, motion
 
 
 @leaf_kernel
-def _hold_back(
-    constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work
-) -> bool:  # fmt: skip
+def _hold_back(constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work) -> bool:
     """Write what the guards let pass into row _SENT of the work, which `_let_pass` left; return whether any acts."""
     c, w = constants[0], work.w
     near = _near(constants, cover, seen, model, motion, work)
@@ -438,9 +481,16 @@ def _copy_seen(seen: Field, rho_force: F64, nearest: I32) -> None:
 
 @leaf_kernel
 def law(
-    constants: Record, cover: Cover, seen: Field, model: Model, space: OperationalSpace, obstacles: Obstacles,
-    motion: Motion, memory: WorkMemory, out: Outputs,
-) -> tuple[float, int]:  # fmt: skip
+    constants: Record,
+    cover: Cover,
+    seen: Field,
+    model: Model,
+    space: OperationalSpace,
+    obstacles: Obstacles,
+    motion: Motion,
+    memory: WorkMemory,
+    out: Outputs,
+) -> tuple[float, int]:
     """Write the torques of a tick into `out`; return the least distance between links [m], and Law.cut.
 
     The whole law is one kernel without an array of its own, so that nothing is counted or allocated on the way.

@@ -54,10 +54,16 @@ def rows_in(real: F64, whole: I64, n: int) -> Rows:
     b = a + 4 * r
     c = b + n * n
     return Rows(
-        real[:a].reshape(r, n), real[a : a + r], real[a + r : a + 2 * r], real[a + 2 * r : b].reshape(2, r),
-        real[b:c].reshape(n, n), real[c : c + 2 * n].reshape(2, n), real[c + 2 * n : c + 3 * n],
-        real[c + 3 * n : c + 4 * n], whole[:2],
-    )  # fmt: skip
+        real[:a].reshape(r, n),
+        real[a : a + r],
+        real[a + r : a + 2 * r],
+        real[a + 2 * r : b].reshape(2, r),
+        real[b:c].reshape(n, n),
+        real[c : c + 2 * n].reshape(2, n),
+        real[c + 2 * n : c + 3 * n],
+        real[c + 3 * n : c + 4 * n],
+        whole[:2],
+    )
 
 
 @leaf_kernel

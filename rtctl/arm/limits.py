@@ -119,9 +119,24 @@ def permit(
 
 @kernel
 def command_torque(
-    drive: F64, keep: F64, qd: F64, sent: F64, echo: F64, age: F64, tau_max: F64, tau_rate: F64, tau_lsb: F64, D: F64,
-    A_inv: F64, h: F64, g: F64, viscous: F64, dt: float, torque: bool, moving: bool,
-) -> tuple[F64, int, float, bool]:  # fmt: skip
+    drive: F64,
+    keep: F64,
+    qd: F64,
+    sent: F64,
+    echo: F64,
+    age: F64,
+    tau_max: F64,
+    tau_rate: F64,
+    tau_lsb: F64,
+    D: F64,
+    A_inv: F64,
+    h: F64,
+    g: F64,
+    viscous: F64,
+    dt: float,
+    torque: bool,
+    moving: bool,
+) -> tuple[F64, int, float, bool]:
     """Return what goes out this tick, with all that follows from it, in one compiled call.
 
     drive, keep, qd, tau_max, tau_rate, D: of `permit`. sent: (4, n) [Nm] the last commands, newest first. echo (n,)

@@ -186,27 +186,41 @@ class Memory(msgspec.Struct, frozen=True):
         if not h["has_goal"]:
             return None
         return Goal(
-            h["goal"], h["goal_wxyz"], Task(int(h["goal_task"])), float(h["goal_tolerance"]),
-            float(h["goal_tolerance_rot"]), h["goal_axis"], h["goal_posture"][: self.n] if h["has_posture"] else None,
-        )  # fmt: skip
+            h["goal"],
+            h["goal_wxyz"],
+            Task(int(h["goal_task"])),
+            float(h["goal_tolerance"]),
+            float(h["goal_tolerance_rot"]),
+            h["goal_axis"],
+            h["goal_posture"][: self.n] if h["has_posture"] else None,
+        )
 
     @property
     def hold(self) -> Goal:
         """Return where the tip stays without a goal."""
         h = record_of(self.hot)[0]
         return Goal(
-            h["hold"], h["hold_wxyz"], Task(int(h["hold_task"])), float(h["hold_tolerance"]),
-            float(h["hold_tolerance_rot"]), h["hold_axis"],
-        )  # fmt: skip
+            h["hold"],
+            h["hold_wxyz"],
+            Task(int(h["hold_task"])),
+            float(h["hold_tolerance"]),
+            float(h["hold_tolerance_rot"]),
+            h["hold_axis"],
+        )
 
     @property
     def escape(self) -> Escape:
         """Return the escape."""
         h = record_of(self.hot)[0]
         return Escape(
-            Phase(int(h["escape_phase"])), float(h["escape_hit"]), h["escape_n"], h["escape_b"], h["escape_costs"],
-            int(h["escape_ticks"]), int(h["escape_slow"]),
-        )  # fmt: skip
+            Phase(int(h["escape_phase"])),
+            float(h["escape_hit"]),
+            h["escape_n"],
+            h["escape_b"],
+            h["escape_costs"],
+            int(h["escape_ticks"]),
+            int(h["escape_slow"]),
+        )
 
     def _replace(self, **changes: Any) -> "Memory":
         """Return a memory with other values in the fields named, as a named tuple's `_replace` does."""
@@ -249,8 +263,10 @@ def write(hot: F64, changes: dict[str, Any]) -> None:
         elif name == "hold":
             h["hold"], h["hold_wxyz"], h["hold_task"] = value.position, value.wxyz, int(value.task)
             h["hold_axis"], h["hold_tolerance"], h["hold_tolerance_rot"] = (
-                value.axis, value.tolerance, value.tolerance_rot,
-            )  # fmt: skip
+                value.axis,
+                value.tolerance,
+                value.tolerance_rot,
+            )
         elif name == "escape":
             for key, each in zip(Escape._fields, value, strict=True):
                 h[f"escape_{key}"] = each

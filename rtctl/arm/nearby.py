@@ -46,7 +46,7 @@ class Nearby(NamedTuple):
 @leaf_kernel
 def nearby_in(
     whole: I64, real: F64, points: MovingPoints, seen: Field, qd: F64, braking: float, tau_rate: F64
-) -> Nearby:  # fmt: skip
+) -> Nearby:
     """Return the points near obstacles in flat arrays, (3 c + 1,) and (c + 4 m + n + 1,) for c candidates at most."""
     c, m = (whole.shape[0] - 1) // 3, points.radius.shape[0]
     found = Candidates(whole[: 3 * c].reshape(3, c), real[:c], real[c : c + 4 * m].reshape(4, m), real[c + 4 * m :])

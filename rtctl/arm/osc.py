@@ -200,7 +200,7 @@ TASK_DRIVE, TASK_BRAKE, POSTURE_SPRING, POSTURE_DAMPER = 0, 1, 2, 3
 @leaf_kernel
 def motion_torque(
     at: TaskDynamics, actual: Twist, reference: Twist, q: F64, qd: F64, q_rest: F64, p: MotionParams, F: F64, out: F64
-) -> None:  # fmt: skip
+) -> None:
     """Write F*_m (6,) [m/s2, rad/s2] and the torques (4, n) [Nm] by the rows above (Khatib 1986 eq. 8, 1987).
 
     F*_m = -k_v (xd - nu xd_d);  tau_motion = J^T Lambda (F*_m - Jd qd) = drive + brake

@@ -105,12 +105,24 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         table_of(table.obstacles, table.age, far, far),
     )
     return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes)._replace(
-        tick=-1, state=State.IDLE, since=-1, good=np.full(len(FAULTS), 1 << 30), clear_until=-1,
-        joints=joint_start(q, robot.joint_P), tip=start(model.x, model.R, robot.tip_design),
-        task=robot.axes, axis=TOOL_Z, evaluated=True, q_previous=q,
-        hold=hold_at(model.x, model.R, robot.axes), escape=Escape(), q_rest=q, blocker=-1,
-        nearest=np.inf, speed_scale=START_SPEED_SCALE,
-    )  # fmt: skip
+        tick=-1,
+        state=State.IDLE,
+        since=-1,
+        good=np.full(len(FAULTS), 1 << 30),
+        clear_until=-1,
+        joints=joint_start(q, robot.joint_P),
+        tip=start(model.x, model.R, robot.tip_design),
+        task=robot.axes,
+        axis=TOOL_Z,
+        evaluated=True,
+        q_previous=q,
+        hold=hold_at(model.x, model.R, robot.axes),
+        escape=Escape(),
+        q_rest=q,
+        blocker=-1,
+        nearest=np.inf,
+        speed_scale=START_SPEED_SCALE,
+    )
 
 
 def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
@@ -144,10 +156,17 @@ def _with_side(robot: Robot, m: Memory) -> Memory:
     to = goal._replace(position=point_of(goal, m.tip.x))
     return m._replace(
         escape=escape.chosen(
-            m.escape, m.model, m.tip.x, to, m.world.obstacles, robot.base, robot.reach, robot.avoid.rho0,
+            m.escape,
+            m.model,
+            m.tip.x,
+            to,
+            m.world.obstacles,
+            robot.base,
+            robot.reach,
+            robot.avoid.rho0,
             robot.motion.epsilon,
         )
-    )  # fmt: skip
+    )
 
 
 def _diagnosed(robot: Robot, m: Memory, before: Memory, record: Record) -> Memory:

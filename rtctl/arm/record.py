@@ -114,9 +114,16 @@ def _put_record(out: U32, at: int, values: F64, longs: F64) -> int:
 
 @kernel
 def pack(
-    m: Any, f: Feedback, o: Outcome, errors: tuple[float, float, float], F: F64, torques: F64, seen: F64, nearest: I32,
+    m: Any,
+    f: Feedback,
+    o: Outcome,
+    errors: tuple[float, float, float],
+    F: F64,
+    torques: F64,
+    seen: F64,
+    nearest: I32,
     dt: float,
-) -> U32:  # fmt: skip
+) -> U32:
     """Return the record of one tick in words of four bytes, of which every field is a whole number.
 
     m: the memory after it. errors: error [m], error_rot [rad], sigma_min [1/kg]. seen: (4 slots,) rho [m], then force

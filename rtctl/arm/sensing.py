@@ -73,9 +73,13 @@ def plausible_feedback(c: Any, m: Any, f: Feedback) -> tuple[Feedback, bool]:
 @kernel
 def _estimator(c: Any) -> EstimatorParams:
     return EstimatorParams(
-        c.estimator_sigma_a, c.estimator_sigma_alpha, c.estimator_r_v, c.estimator_r_omega, c.estimator_r_x,
+        c.estimator_sigma_a,
+        c.estimator_sigma_alpha,
+        c.estimator_r_v,
+        c.estimator_r_omega,
+        c.estimator_r_x,
         c.estimator_r_rot,
-    )  # fmt: skip
+    )
 
 
 @kernel
@@ -84,16 +88,36 @@ def predict(c: Any, m: Any, f: Feedback, model: Model, elapsed: float) -> bool:
     n = f.q.shape[0]
     qdd = m.qdd[:n].copy()
     q, qd, P, surprise = filter_joints(
-        m.q[:n].copy(), m.qd[:n].copy(), m.P[:n].copy(), qdd, f.q, f.qd, f.age, f.replies, elapsed,
-        c.joint_sigma_qdd[:n].copy(), c.joint_r_q[:n].copy(), c.joint_r_qd[:n].copy(), c.joint_has_qd != 0.0,
-    )  # fmt: skip
+        m.q[:n].copy(),
+        m.qd[:n].copy(),
+        m.P[:n].copy(),
+        qdd,
+        f.q,
+        f.qd,
+        f.age,
+        f.replies,
+        elapsed,
+        c.joint_sigma_qdd[:n].copy(),
+        c.joint_r_q[:n].copy(),
+        c.joint_r_qd[:n].copy(),
+        c.joint_has_qd != 0.0,
+    )
     m.q[:n], m.qd[:n], m.P[:n] = q, qd, P
     m.innovation = largest(surprise)
     if c.carry != 0.0:
         m.x[:], m.xd[:], m.P_tip[:], m.R[:], m.omega[:], m.P_rot[:] = predict_tip(
-            m.x.copy(), m.xd.copy(), m.P_tip.copy(), m.R.copy(), m.omega.copy(), m.P_rot.copy(),
-            model.J, model.Jdqd, qdd, elapsed, _estimator(c),
-        )  # fmt: skip
+            m.x.copy(),
+            m.xd.copy(),
+            m.P_tip.copy(),
+            m.R.copy(),
+            m.omega.copy(),
+            m.P_rot.copy(),
+            model.J,
+            model.Jdqd,
+            qdd,
+            elapsed,
+            _estimator(c),
+        )
     phase = m.phase + c.dt / c.model_dt
     m.evaluated = 1 if phase > 0.0 else 0
     m.phase = phase - 1.0 if phase > 0.0 else phase
@@ -137,17 +161,50 @@ def detect_faults(c: Any, m: Any, f: Feedback, A: F64, around: Surroundings, imp
     powered = drives_torque(m)
     active = powered and m.state != _ARMED
     watch, age, feed_age, seen = notice(
-        m.watch[:, :n].copy(), active, f.q, f.qd, f.tau, f.age, f.replies, f.drive, m.sent[:, :n].copy(),
-        m.q_previous[:n].copy(), m.age_previous[:n].copy(), m.qdd[:n].copy(), A, around.rho, around.goal_rho,
-        around.age, around.moving, c.safety_torque_tolerance[:n].copy(), c.safety_friction[:n].copy(),
-        c.safety_velocity_tolerance[:n].copy(), c.safety_limit_tolerance, c.safety_speed_tolerance, REST_SPEED,
-        c.q_min[:n].copy(), c.q_max[:n].copy(), c.qd_max[:n].copy(), c.dt * (1 + f.missed), c.dt,
-    )  # fmt: skip
+        m.watch[:, :n].copy(),
+        active,
+        f.q,
+        f.qd,
+        f.tau,
+        f.age,
+        f.replies,
+        f.drive,
+        m.sent[:, :n].copy(),
+        m.q_previous[:n].copy(),
+        m.age_previous[:n].copy(),
+        m.qdd[:n].copy(),
+        A,
+        around.rho,
+        around.goal_rho,
+        around.age,
+        around.moving,
+        c.safety_torque_tolerance[:n].copy(),
+        c.safety_friction[:n].copy(),
+        c.safety_velocity_tolerance[:n].copy(),
+        c.safety_limit_tolerance,
+        c.safety_speed_tolerance,
+        REST_SPEED,
+        c.q_min[:n].copy(),
+        c.q_max[:n].copy(),
+        c.qd_max[:n].copy(),
+        c.dt * (1 + f.missed),
+        c.dt,
+    )
     lost = m.cut & _NON_FINITE != 0 or not math.isfinite(m.innovation)
     evidence = Evidence(
-        seen, age, feed_age, f.missed, active, powered, implausible, m.slew_follows_echo != 0, m.recovering != 0, lost,
-        m.has_goal != 0, m.innovation,
-    )  # fmt: skip
+        seen,
+        age,
+        feed_age,
+        f.missed,
+        active,
+        powered,
+        implausible,
+        m.slew_follows_echo != 0,
+        m.recovering != 0,
+        lost,
+        m.has_goal != 0,
+        m.innovation,
+    )
     k = m.counters
     counters = counted(
         f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]), c.safety_innovation_max

@@ -153,10 +153,24 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
     command = _torque_asked(c, m, f)
     on = command == _TORQUE
     rows, cut, _, follows = command_torque(
-        drive, keep, m.qd[:n].copy(), m.sent[:, :n].copy(), f.tau, f.age, c.tau_max[:n].copy(), c.tau_rate[:n].copy(),
-        c.tau_lsb[:n].copy(), c.stop_damping[:n].copy(), model.A_inv, model.h, model.g, c.viscous[:n].copy(), c.dt,
-        on, on and m.state != _ARMED,  # in ARMED brakes may still hold the arm
-    )  # fmt: skip
+        drive,
+        keep,
+        m.qd[:n].copy(),
+        m.sent[:, :n].copy(),
+        f.tau,
+        f.age,
+        c.tau_max[:n].copy(),
+        c.tau_rate[:n].copy(),
+        c.tau_lsb[:n].copy(),
+        c.stop_damping[:n].copy(),
+        model.A_inv,
+        model.h,
+        model.g,
+        c.viscous[:n].copy(),
+        c.dt,
+        on,
+        on and m.state != _ARMED,  # in ARMED brakes may still hold the arm
+    )
     m.sent[:, :n], m.qdd[:n], m.cut, m.slew_follows_echo = (
         rows[1:5],
         rows[5],
@@ -177,19 +191,45 @@ def _act(
     at = model
     if c.carry == 0.0:  # the points have not moved either
         at = Model(
-            q, model.qd, model.A, model.A_inv, model.h, model.g, model.x, model.R, model.J, model.Jdqd, model.P,
-            model.Jp, model.B, model.Lambda_inv, model.own_rho, model.own_row,
-        )  # fmt: skip
+            q,
+            model.qd,
+            model.A,
+            model.A_inv,
+            model.h,
+            model.g,
+            model.x,
+            model.R,
+            model.J,
+            model.Jdqd,
+            model.P,
+            model.Jp,
+            model.B,
+            model.Lambda_inv,
+            model.own_rho,
+            model.own_row,
+        )
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
     _, m.cut = law(
-        arm.constants, Cover(arm.radius, arm.link), field, at, space, around.obstacles,
+        arm.constants,
+        Cover(arm.radius, arm.link),
+        field,
+        at,
+        space,
+        around.obstacles,
         Motion(
-            q, qd, Twist(xd, omega), Twist(e, e_rot), Twist(m.v_ref.copy(), m.w_ref.copy()), q_rest, m.speed_scale,
+            q,
+            qd,
+            Twist(xd, omega),
+            Twist(e, e_rot),
+            Twist(m.v_ref.copy(), m.w_ref.copy()),
+            q_rest,
+            m.speed_scale,
             m.qdd[:n].copy(),
         ),
-        WorkMemory(arm.reals, arm.wholes), out,
-    )  # fmt: skip
+        WorkMemory(arm.reals, arm.wholes),
+        out,
+    )
     task, torques, seen, nearest = out
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin
@@ -200,17 +240,30 @@ def _act(
     flags = progress_timers(c, m, pursued, p)
     shown = target_of(m, m.has_goal != 0)
     raw = pack(
-        m, f, Outcome(asked.verb, command, shown.position, shown.wxyz, shown.axis, shown.task, tau_wanted),
-        (p.error, p.error_rot, space.sigma_min), task[:6], torques[: LOAD + 1], seen, nearest, c.dt,
-    )  # fmt: skip
+        m,
+        f,
+        Outcome(asked.verb, command, shown.position, shown.wxyz, shown.axis, shown.task, tau_wanted),
+        (p.error, p.error_rot, space.sigma_min),
+        task[:6],
+        torques[: LOAD + 1],
+        seen,
+        nearest,
+        c.dt,
+    )
     return raw, flags
 
 
 @kernel
 def servo(
-    arm: Arm, before: F64, parameters: F64, table_before: F64, shapes: F64, bodies: BODIES, feedback: Feedback,
+    arm: Arm,
+    before: F64,
+    parameters: F64,
+    table_before: F64,
+    shapes: F64,
+    bodies: BODIES,
+    feedback: Feedback,
     asked: int,
-) -> tuple[F64, F64, U32, int]:  # fmt: skip
+) -> tuple[F64, F64, U32, int]:
     """Run the servo level of one tick from a stage on, or until Python is needed.
 
     before: the memory, see `memory.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.

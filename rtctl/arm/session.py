@@ -29,9 +29,13 @@ def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, pr
     clearing = verb == Verb.RESET and supervisor.admits(before, verb) and bool(present & BIT["drive_fault"])
     outside = verb == Verb.ARM and m.outside
     asked = Asked(
-        m.tick, verb, present, _timed(robot, m, reductions.all_equal(feedback.drive, 1)),
-        CLEARING if clearing else "", OUTSIDE if outside else "",
-    )  # fmt: skip
+        m.tick,
+        verb,
+        present,
+        _timed(robot, m, reductions.all_equal(feedback.drive, 1)),
+        CLEARING if clearing else "",
+        OUTSIDE if outside else "",
+    )
     step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
     m = m._replace(**step.session._asdict(), verdict=step.refusal or m.verdict)
     if clearing:
@@ -100,9 +104,16 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
 def free_of_goals(m: Memory) -> Memory:
     """Return the memory without a goal and what was known of it."""
     return m._replace(
-        goal=None, status=Status.NO_GOAL, blocker=-1, blockers=0, blocked_by=(), still=0, nearest=np.inf,
-        stall_timer=0.0, escape=Escape(),
-    )  # fmt: skip
+        goal=None,
+        status=Status.NO_GOAL,
+        blocker=-1,
+        blockers=0,
+        blocked_by=(),
+        still=0,
+        nearest=np.inf,
+        stall_timer=0.0,
+        escape=Escape(),
+    )
 
 
 def _is_posture(robot: Robot, q: np.ndarray) -> bool:

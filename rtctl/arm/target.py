@@ -93,9 +93,14 @@ def _hold_here(c: Any, m: Any) -> None:
 @kernel
 def _escape_of(m: Any) -> Escape:
     return Escape(
-        m.escape_phase, m.escape_hit, m.escape_n.copy(), m.escape_b.copy(), m.escape_costs.copy(), m.escape_ticks,
+        m.escape_phase,
+        m.escape_hit,
+        m.escape_n.copy(),
+        m.escape_b.copy(),
+        m.escape_costs.copy(),
+        m.escape_ticks,
         m.escape_slow,
-    )  # fmt: skip
+    )
 
 
 @kernel

@@ -22,9 +22,12 @@ def add(commands: Commands) -> None:
     info = command(actions, "info", "what a log holds, and how it ended", "rtctl log info run.mcap --json", _info)
     _file(info)
     doctor = command(
-        actions, "doctor", "is a log whole: structure, checksums, numbers, time, decoding",
-        "rtctl log doctor run.mcap", _doctor,
-    )  # fmt: skip
+        actions,
+        "doctor",
+        "is a log whole: structure, checksums, numbers, time, decoding",
+        "rtctl log doctor run.mcap",
+        _doctor,
+    )
     _file(doctor)
     recover = command(
         actions,
@@ -40,16 +43,22 @@ def add(commands: Commands) -> None:
     )
     recover.add_argument("--json", action="store_true", help="print one JSON object")
     can = command(
-        actions, "can", "what went over the CAN buses: identifiers, rates, changes, losses, values",
-        "rtctl log can run.mcap\n  rtctl log can run.mcap --dbc configs/drive.dbc --values", _can,
-    )  # fmt: skip
+        actions,
+        "can",
+        "what went over the CAN buses: identifiers, rates, changes, losses, values",
+        "rtctl log can run.mcap\n  rtctl log can run.mcap --dbc configs/drive.dbc --values",
+        _can,
+    )
     _file(can)
     can.add_argument("--dbc", metavar="FILE", default="", help="decode by this DBC; default: the one in the log")
     can.add_argument("--values", action="store_true", help="smallest, largest and last value of every signal")
     mavlink = command(
-        actions, "mavlink", "what went over the MAVLink links: senders, messages, rates, losses",
-        "rtctl log mavlink rover.mcap", _mavlink,
-    )  # fmt: skip
+        actions,
+        "mavlink",
+        "what went over the MAVLink links: senders, messages, rates, losses",
+        "rtctl log mavlink rover.mcap",
+        _mavlink,
+    )
     _file(mavlink)
     tail = command(
         actions, "tail", "follow a log while it is written", "rtctl log tail\n  rtctl log tail logs/ --json", _tail
@@ -171,11 +180,20 @@ def _can(arguments: argparse.Namespace) -> int:
     head = ["bus", "id", "", "name", "frames", "Hz", "longest gap", "changed", "lost", "bytes", "last data"]
     rows = [
         [
-            t.bus, f"{t.id:03X}", t.way, t.name, str(t.frames), f"{t.hz:.1f}", f"{t.gap_max * 1e3:.2f} ms",
-            f"{100.0 * t.changes / t.frames:.1f} %", "-" if t.lost < 0 else str(t.lost), str(t.length), t.data,
+            t.bus,
+            f"{t.id:03X}",
+            t.way,
+            t.name,
+            str(t.frames),
+            f"{t.hz:.1f}",
+            f"{t.gap_max * 1e3:.2f} ms",
+            f"{100.0 * t.changes / t.frames:.1f} %",
+            "-" if t.lost < 0 else str(t.lost),
+            str(t.length),
+            t.data,
         ]
         for t in found
-    ]  # fmt: skip
+    ]
     print(table(rows, head, frozenset((4, 5, 6, 7, 8, 9))))
     if arguments.values:
         signals = [

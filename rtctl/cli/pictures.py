@@ -30,10 +30,13 @@ def add(actions: Commands) -> None:
     export.add_argument("--topic", metavar="TOPIC", default="/tick", help="for csv and parquet; default: %(default)s")
     export.add_argument("--fields", metavar="A,B,…", default="", help="fields of the topic; default: all")
     plot = command(
-        actions, "plot", "draw chosen fields over time",
+        actions,
+        "plot",
+        "draw chosen fields over time",
         "rtctl log plot run.mcap --fields x,error,tau_sent --from 2 --to 4 --out run.png\n"
-        "  rtctl log plot run.mcap --list", _plot,
-    )  # fmt: skip
+        "  rtctl log plot run.mcap --list",
+        _plot,
+    )
     plot.add_argument("file", metavar="FILE", type=log_file)
     plot.add_argument("--fields", metavar="A,B,…", default="x,error,rho,tau_sent", help="default: %(default)s")
     plot.add_argument("--from", dest="start", metavar="S", type=number, default=0.0, help="after the log's begin")
@@ -41,9 +44,12 @@ def add(actions: Commands) -> None:
     plot.add_argument("--out", metavar="PICTURE", default="", help="png, svg or pdf; default: beside the log")
     plot.add_argument("--list", action="store_true", help="print the fields, their units and meanings")
     report = command(
-        actions, "report", "write one HTML page about a log that needs no network",
-        "rtctl log report run.mcap\n  rtctl log report run.mcap --out run.html --png run.png", _report,
-    )  # fmt: skip
+        actions,
+        "report",
+        "write one HTML page about a log that needs no network",
+        "rtctl log report run.mcap\n  rtctl log report run.mcap --out run.html --png run.png",
+        _report,
+    )
     report.add_argument("file", metavar="FILE", type=log_file)
     report.add_argument("--out", metavar="FILE", default="", help="default: beside the log, .html")
     report.add_argument("--png", metavar="PICTURE", default="", help="also draw its main plots into one picture")

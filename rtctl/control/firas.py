@@ -63,9 +63,17 @@ def field_buffers(slots: int, m: int, n: int) -> Field:
     z = np.zeros
     whole = np.int64
     return Field(
-        z(n), z(slots), z(slots, whole), z((slots, 3)), z((slots, 6, m)), z((15, m)), z((slots, n + 1)),
-        z(slots, whole), z((slots, m), whole), z(slots, whole),
-    )  # fmt: skip
+        z(n),
+        z(slots),
+        z(slots, whole),
+        z((slots, 3)),
+        z((slots, 6, m)),
+        z((15, m)),
+        z((slots, n + 1)),
+        z(slots, whole),
+        z((slots, m), whole),
+        z(slots, whole),
+    )
 
 
 def eta_of(v_max: float, rho0: float, rho_min: float) -> float:

@@ -85,13 +85,18 @@ def _bus(c: Config) -> list[Row]:
 def _loop(c: Config, r: Robot) -> list[Row]:
     ratio = r.model_dt / r.dt
     return [
-        _row("servo period", 1e3 * r.dt, "ms", f"{c.loop.servo_hz:g} Hz, real time {c.loop.realtime}",
-             c.loop.realtime == "required"),
+        _row(
+            "servo period",
+            1e3 * r.dt,
+            "ms",
+            f"{c.loop.servo_hz:g} Hz, real time {c.loop.realtime}",
+            c.loop.realtime == "required",
+        ),
         _row("model period", 1e3 * r.model_dt, "ms", f"{c.loop.model_hz:g} Hz, every {ratio:g} servo periods"),
         _row("drive watchdog", c.safety.watchdog_ms, "ms", f"{c.safety.watchdog_ms / (1e3 * r.dt):.1f} servo periods"),
         _row("stale: hold", r.safety.stale_periods, "periods", f"{c.safety.stale_hold_ms:g} ms"),
         _row("stale: stop", r.safety.lost_periods, "periods", f"{c.safety.stale_stop_ms:g} ms"),
-    ]  # fmt: skip
+    ]
 
 
 def _motion(c: Config, r: Robot) -> list[Row]:
@@ -132,9 +137,14 @@ def _limits(r: Robot, found: Extremes) -> list[Row]:
     i, k = int(spare.argmin()), int((f.rho_num / f.rho_min).argmax())
     return [
         _row("joint rho_num", f.rho_num[k], "rad", f"worst: {r.joints[k]}; at most the clearance {f.rho_min[k]:g}"),
-        _row("joint-limit braking", spare[i], "x", f"torque gravity leaves over torque to brake, worst: {r.joints[i]}",
-             bool(spare[i] >= 1.0)),
-    ]  # fmt: skip
+        _row(
+            "joint-limit braking",
+            spare[i],
+            "x",
+            f"torque gravity leaves over torque to brake, worst: {r.joints[i]}",
+            bool(spare[i] >= 1.0),
+        ),
+    ]
 
 
 def _zone_speed(r: Robot) -> F64:
@@ -159,6 +169,11 @@ def _points(c: Config, r: Robot) -> list[Row]:
         _row("points cover", 100 * cover.fraction, "%", "of the links' surface samples", fine),
         _row("protrusion", cover.protrusion, "m", f"of a link beyond its points; clearance {r.avoid.rho_min:g}", fine),
         _row("overhang", cover.overhang, "m", "of the points beyond the links"),
-        _row("self-collision pairs", len(r.own.pairs), "", "watched" if c.avoid.self_collision else "switched off",
-             c.avoid.self_collision),
-    ]  # fmt: skip
+        _row(
+            "self-collision pairs",
+            len(r.own.pairs),
+            "",
+            "watched" if c.avoid.self_collision else "switched off",
+            c.avoid.self_collision,
+        ),
+    ]

@@ -45,7 +45,12 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         limits=Limits(m.v_max_m_s, m.a_max_m_s2, m.w_max_rad_s, m.alpha_max_rad_s2, b.turn_radius_m, b.reverse),
         # a cell's centre may lie half its diagonal from what it stands for
         margins=Margins(
-            hull(c), hull(c) + a.clearance_m + math.sqrt(0.5) * CELL, a.stop_m, b.brake_m_s2, b.lag_s, b.turn_lag_s,
+            hull(c),
+            hull(c) + a.clearance_m + math.sqrt(0.5) * CELL,
+            a.stop_m,
+            b.brake_m_s2,
+            b.lag_s,
+            b.turn_lag_s,
             b.height_m,
         ),
         points=points,
@@ -53,8 +58,14 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         field=field_params(m.v_max_m_s, a.influence_m, a.clearance_m, dt, a.damping_ratio, a.lookahead_s, 1.0),
         noise=Noise(c.estimator.acceleration_m_s2, c.estimator.position_m, c.estimator.velocity_m_s),
         safety=SafetyParams(
-            s.heartbeat_hold_s, s.heartbeat_stop_s, 1e-3 * s.stale_hold_ms, 1e-3 * s.stale_stop_ms, s.scan_stale_s,
-            a.scan == "required", s.obstacle_stale_s, s.jump_m,
+            s.heartbeat_hold_s,
+            s.heartbeat_stop_s,
+            1e-3 * s.stale_hold_ms,
+            1e-3 * s.stale_stop_ms,
+            s.scan_stale_s,
+            a.scan == "required",
+            s.obstacle_stale_s,
+            s.jump_m,
             a.seen_s,
         ),
         obstacles=obstacles,
@@ -65,7 +76,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         engage=s.engage_s,
         sense=a.range_m,
         sensors=tuple(sensor.name for sensor in c.sensor) or ("scan", "beams"),
-    )  # fmt: skip
+    )
     at = np.column_stack([points, np.full(len(points), b.height_m)])
     for i, shape in enumerate(base.obstacles):
         rho = distance(shape, at, assets.meshes)[0] - radius
@@ -102,10 +113,22 @@ def report(c: BaseConfig, base: Base) -> Report:
     f, m = base.field, base.margins
     stop = braking_distance(c)
     rows = [
-        _row("servo period", 1e3 * base.dt, "ms", f"{c.loop.servo_hz:g} Hz, set-points at the same rate",
-             c.loop.realtime == "required"),
-        _row("signing", int(c.link.signing == "required"), "", "MAVLink 2, both ways" if c.link.signing == "required"
-             else "off: whoever reaches the link can drive the vehicle", c.link.signing == "required"),
+        _row(
+            "servo period",
+            1e3 * base.dt,
+            "ms",
+            f"{c.loop.servo_hz:g} Hz, set-points at the same rate",
+            c.loop.realtime == "required",
+        ),
+        _row(
+            "signing",
+            int(c.link.signing == "required"),
+            "",
+            "MAVLink 2, both ways"
+            if c.link.signing == "required"
+            else "off: whoever reaches the link can drive the vehicle",
+            c.link.signing == "required",
+        ),
         _row("hull", m.hull, "m", "circle that the footprint turns in"),
         _row("points (PSPs)", len(base.point_radius), "", "on the footprint"),
         _row("k_p", base.k_p, "1/s2", "stiffness of the unit mass"),
@@ -117,10 +140,15 @@ def report(c: BaseConfig, base: Base) -> Report:
         _row("gap that is passed", 2.0 * m.room, "m", "narrower ones are walls"),
         _row("range", base.sense, "m", "of the scan that is believed"),
         _row("reverse", int(base.limits.reverse), "", _ways(base), base.limits.reverse or base.limits.radius == 0.0),
-        _row("scan", int(base.safety.scan), "", "required" if base.safety.scan else
-             "off: only what is told is avoided", base.safety.scan),
+        _row(
+            "scan",
+            int(base.safety.scan),
+            "",
+            "required" if base.safety.scan else "off: only what is told is avoided",
+            base.safety.scan,
+        ),
         _row("reach", base.reach, "m", "no goal further from the origin is taken"),
-    ]  # fmt: skip
+    ]
     if (line := streams(c)) is not None:
         note = f"received, position and attitude at {line.quick:g} Hz; {MOST:.0%} at most"
         rows.append(_row("line", line.received, "", note))

@@ -94,11 +94,15 @@ def run(say: Say = unsaid, rates: tuple[float, ...] = RATES, phases: int = PHASE
         moments = np.linspace(0.0, 1.0, phases, endpoint=False)
         at = [[_left(plain, dt, part * V_MAX, float(p)) for p in moments] for part in SPEEDS]
         full = max(at[-1])
-        rows.append((
-            full, max(map(max, at)), max(_left(capped, dt, V_MAX, float(p)) for p in moments),
-            max(_left(used, dt, V_MAX, float(p)) for p in moments),
-            min(float(bounce(used, dt, V_MAX, float(p)).rho.min()) for p in moments),
-        ))  # fmt: skip
+        rows.append(
+            (
+                full,
+                max(map(max, at)),
+                max(_left(capped, dt, V_MAX, float(p)) for p in moments),
+                max(_left(used, dt, V_MAX, float(p)) for p in moments),
+                min(float(bounce(used, dt, V_MAX, float(p)).rho.min()) for p in moments),
+            )
+        )
         if rate in SHOWN:
             orbits[rate] = bounce(plain, dt, V_MAX)
         say((k + 1) / len(rates))
@@ -142,8 +146,14 @@ def _orbits(axes: Axes, data: Data) -> None:
     least = turning_distance(V_MAX, field_params(V_MAX, INFLUENCE, CLEARANCE, 1e-3, 1.0, 0.0, 1e3))
     rho = np.concatenate([[INFLUENCE * 1.4], np.geomspace(INFLUENCE, least, 200)])
     v = np.sqrt(np.maximum(V_MAX**2 - eta * np.maximum(1.0 / rho - 1.0 / INFLUENCE, 0.0) ** 2, 0.0))
-    axes.plot(1e3 * np.concatenate([rho, rho[::-1]]), np.concatenate([-v, v[::-1]]), color=INK, lw=1.3,
-              ls=(0, (2, 2)), label="continuous")  # fmt: skip
+    axes.plot(
+        1e3 * np.concatenate([rho, rho[::-1]]),
+        np.concatenate([-v, v[::-1]]),
+        color=INK,
+        lw=1.3,
+        ls=(0, (2, 2)),
+        label="continuous",
+    )
     for (rate, orbit), colour in zip(data.orbits.items(), (BLUE, ORANGE, RED), strict=False):
         marks = {"marker": "o", "ms": 4.5} if rate < 300.0 else {}
         axes.plot(1e3 * orbit.rho, orbit.v, color=colour, lw=2.0, label=f"{rate:.0f} Hz", **marks)

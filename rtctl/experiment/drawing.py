@@ -19,8 +19,9 @@ def strobes(q: F64, count: int) -> I64:
     return np.searchsorted(way, np.linspace(0.0, way[-1] * (1.0 - 1e-9), count)).clip(max=len(q) - 1)
 
 
-def draw_shapes(axes: Axes, shapes: Iterable[Shape], seen: Projection, colour: str = STONE, alpha: float = 1.0,
-                zorder: float = 3.0) -> None:  # fmt: skip
+def draw_shapes(
+    axes: Axes, shapes: Iterable[Shape], seen: Projection, colour: str = STONE, alpha: float = 1.0, zorder: float = 3.0
+) -> None:
     """Draw obstacles as solids with an outline."""
     for shape in shapes:
         ring = half_space(shape, seen) if shape.type == "plane" else outline(shape, seen)
@@ -40,8 +41,16 @@ def half_space(shape: Shape, seen: Projection) -> F64:
     return np.array([point - along, point + along, point + along - normal * REACH, point - along - normal * REACH])
 
 
-def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: Projection, colour: tuple[float, float, float] | str,
-             zorder: float, edge: str | tuple[float, float, float] = PAPER, lw: float = 0.7) -> None:  # fmt: skip
+def draw_arm(
+    axes: Axes,
+    figurine: Figurine,
+    q: F64,
+    seen: Projection,
+    colour: tuple[float, float, float] | str,
+    zorder: float,
+    edge: str | tuple[float, float, float] = PAPER,
+    lw: float = 0.7,
+) -> None:
     """Draw the solids of an arm at q (n,), the nearest to the beholder last."""
     for piece in figurine.pieces(q, seen):
         still = piece.link == 0  # the base is the same in every frame
@@ -49,8 +58,9 @@ def draw_arm(axes: Axes, figurine: Figurine, q: F64, seen: Projection, colour: t
         axes.add_patch(Polygon(piece.polygon, fc=fc, ec=ec, lw=lw, joinstyle="round", zorder=4.0 if still else zorder))
 
 
-def draw_strobes(axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[int] | I64, seen: Projection,
-                 zorder: float = 5.0) -> None:  # fmt: skip
+def draw_strobes(
+    axes: Axes, figurine: Figurine, trace: Trace, rows: Sequence[int] | I64, seen: Projection, zorder: float = 5.0
+) -> None:
     """Draw an arm at several rows of a trace, from light to dark."""
     for k, row in enumerate(rows):
         part = k / max(len(rows) - 1, 1)

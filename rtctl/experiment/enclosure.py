@@ -65,8 +65,9 @@ def draw(data: Data) -> Figure:
         size=(11.0, 6.6),
     )
     count = len(data.goals)
-    grid = figure.add_gridspec(2, count, left=0.075, right=0.985, top=0.855, bottom=0.105, wspace=0.05, hspace=0.22,
-                               height_ratios=(1.9, 1.0))  # fmt: skip
+    grid = figure.add_gridspec(
+        2, count, left=0.075, right=0.985, top=0.855, bottom=0.105, wspace=0.05, hspace=0.22, height_ratios=(1.9, 1.0)
+    )
     figurine = Figurine(trace.robot.body)
     for k in range(count):
         _drawing(figure.add_subplot(grid[0, k]), data, figurine, k)

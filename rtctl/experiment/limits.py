@@ -140,5 +140,13 @@ def _joints(axes: Axes, data: Data) -> None:
     axes.set_xlim(0.0, trace.time[-1])
     axes.set_xlabel("time [s]")
     axes.text(0.0, 1.1, "joints in their ranges", transform=axes.transAxes, fontsize=13.5, fontweight="bold")
-    axes.legend(loc="lower left", ncols=7, fontsize=11, bbox_to_anchor=(-0.02, 0.99), handlelength=1.0,
-                columnspacing=0.9, handletextpad=0.4, borderpad=0.1)  # fmt: skip
+    axes.legend(
+        loc="lower left",
+        ncols=7,
+        fontsize=11,
+        bbox_to_anchor=(-0.02, 0.99),
+        handlelength=1.0,
+        columnspacing=0.9,
+        handletextpad=0.4,
+        borderpad=0.1,
+    )

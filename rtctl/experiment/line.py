@@ -115,8 +115,9 @@ def draw(data: Data) -> Figure:
         f"Panda through the whole pipe, CAN bytes included: {1e3 * off:.1f} mm off the line at most, "
         f"top speed {data.top_speed:.3f} of {data.v_max} m/s",
     )
-    grid = figure.add_gridspec(2, 2, left=0.075, right=0.985, top=0.81, bottom=0.1, wspace=0.2, hspace=0.5,
-                               width_ratios=(1.15, 1.0))  # fmt: skip
+    grid = figure.add_gridspec(
+        2, 2, left=0.075, right=0.985, top=0.81, bottom=0.1, wspace=0.2, hspace=0.5, width_ratios=(1.15, 1.0)
+    )
     _off(figure.add_subplot(grid[0, 0]), data)
     _speed(figure.add_subplot(grid[1, 0]), data)
     _approach(figure.add_subplot(grid[:, 1]), data)
@@ -132,8 +133,15 @@ def _off(axes: Axes, data: Data) -> None:
     axes.set_xlabel("way along the line [m]")
     axes.set_ylabel("off the line [mm]")
     axes.set_title("Path against the line")
-    axes.legend(loc="upper right", ncols=4, title="goal", alignment="right", handlelength=1.2, columnspacing=1.0,
-                borderaxespad=0.0)  # fmt: skip
+    axes.legend(
+        loc="upper right",
+        ncols=4,
+        title="goal",
+        alignment="right",
+        handlelength=1.2,
+        columnspacing=1.0,
+        borderaxespad=0.0,
+    )
 
 
 def _speed(axes: Axes, data: Data) -> None:
@@ -154,8 +162,15 @@ def _approach(axes: Axes, data: Data) -> None:
         axes.plot(*thinned(leg.t, 1e3 * leg.error), color=colour, lw=2.0)
         t, e = analytic(leg, data.omega)
         shown = e > 2e-5
-        axes.plot(t[shown], 1e3 * e[shown], color=INK, lw=1.3, ls=(0, (2, 2)), zorder=9,
-                  label="critically damped unit mass" if k == 0 else None)  # fmt: skip
+        axes.plot(
+            t[shown],
+            1e3 * e[shown],
+            color=INK,
+            lw=1.3,
+            ls=(0, (2, 2)),
+            zorder=9,
+            label="critically damped unit mass" if k == 0 else None,
+        )
     axes.set_yscale("log")
     axes.set_ylim(0.02, 2000.0)
     axes.set_yticks([0.1, 1.0, 10.0, 100.0, 1000.0], ["0.1", "1", "10", "100", "1000"])

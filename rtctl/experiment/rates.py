@@ -71,9 +71,18 @@ def _played(config: Path, servo: int, model: int, carry: bool, say: Say) -> Run:
     trace = played(scenario, config, say, changes)
     f = trace.figures
     return Run(
-        servo, model, carry, _believed(trace), _off(trace), f["min_clearance_m"]["ball"], f["max_speed_m_s"],
-        _rough(trace), f["arrived"], f["contacts"], tuple(f["faults"]),
-    )  # fmt: skip
+        servo,
+        model,
+        carry,
+        _believed(trace),
+        _off(trace),
+        f["min_clearance_m"]["ball"],
+        f["max_speed_m_s"],
+        _rough(trace),
+        f["arrived"],
+        f["contacts"],
+        tuple(f["faults"]),
+    )
 
 
 def _believed(trace: Trace) -> float:
@@ -161,8 +170,17 @@ def _column(axes: Axes, data: Data, value: Any, scale: str) -> None:
         y = [pairs.index((r.servo, r.model)) for r in runs]
         x = [value(r) for r in runs]
         style = {"mfc": BLUE, "mec": BLUE} if carry else {"mfc": "none", "mec": ORANGE}
-        axes.plot(x, y, "o" if carry else "s", ms=9, mew=2.0, clip_on=False, zorder=5 if carry else 6,
-                  label="with the estimator" if carry else "held still in between", **style)  # fmt: skip
+        axes.plot(
+            x,
+            y,
+            "o" if carry else "s",
+            ms=9,
+            mew=2.0,
+            clip_on=False,
+            zorder=5 if carry else 6,
+            label="with the estimator" if carry else "held still in between",
+            **style,
+        )
         for r, a, b in zip(runs, x, y, strict=True):
             if not r.arrived or r.faults:
                 axes.plot(a, b, "x", ms=13, mec=RED, mew=2.0, zorder=7, clip_on=False)

@@ -121,10 +121,19 @@ def played(
         robots[:] = [servo.robot]
         record = turn.record.reshape(1)[0]
         push = np.linalg.norm(record["force"], axis=1).sum()
-        rows.append((
-            truth.time, truth.q.copy(), truth.tip.copy(), record["x"].copy(), record["rho"].min(), push,
-            record["status"], record["tau_limits"].copy(), record["tau_sent"].copy(),
-        ))  # fmt: skip
+        rows.append(
+            (
+                truth.time,
+                truth.q.copy(),
+                truth.tip.copy(),
+                record["x"].copy(),
+                record["rho"].min(),
+                push,
+                record["status"],
+                record["tau_limits"].copy(),
+                record["tau_sent"].copy(),
+            )
+        )
         for name, d in truth.clearance.items():
             clearance.setdefault(name, [np.nan] * (len(rows) - 1)).append(d)
         for column in clearance.values():

@@ -105,6 +105,14 @@ def level(axes: Axes, y: float, text: str, colour: str = RED, at: float = 0.99, 
     """Draw a horizontal bound with its name at a place (0 to 1) along it."""
     axes.axhline(y, color=colour, lw=1.5, ls=(0, (5, 3)), zorder=3)
     axes.annotate(
-        text, (at, y), xycoords=("axes fraction", "data"), xytext=(0, 4 if above else -4), textcoords="offset points",
-        ha="right" if at > 0.5 else "left", va="bottom" if above else "top", fontsize=12, color=colour, zorder=20,
-    )  # fmt: skip
+        text,
+        (at, y),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 4 if above else -4),
+        textcoords="offset points",
+        ha="right" if at > 0.5 else "left",
+        va="bottom" if above else "top",
+        fontsize=12,
+        color=colour,
+        zorder=20,
+    )

@@ -11,9 +11,15 @@ from rtctl.types import Status
 FIRST = 0.5  # [s] the first goal is given
 OF_GOAL = ("arrived", "error_m", "time_to_goal_s", "line_deviation_m")
 OF_RUN = (
-    "min_clearance_m", "min_self_clearance_m", "contacts", "max_speed_m_s", "max_torque_ratio",
-    "max_joint_speed_ratio", "min_joint_margin_rad", "faults",
-)  # fmt: skip
+    "min_clearance_m",
+    "min_self_clearance_m",
+    "contacts",
+    "max_speed_m_s",
+    "max_torque_ratio",
+    "max_joint_speed_ratio",
+    "min_joint_margin_rad",
+    "faults",
+)
 
 
 def tour(

@@ -98,9 +98,18 @@ def _crc(raw: U8, at: int, can_id: int) -> int:
 
 @kernel
 def _decode(
-    raw: U8, size: int, protected: bool, scale: F64, can_id: I64, words: U8, last: I64, disorder: I64, age: float,
-    state: F64, codes: I64,
-) -> int:  # fmt: skip
+    raw: U8,
+    size: int,
+    protected: bool,
+    scale: F64,
+    can_id: I64,
+    words: U8,
+    last: I64,
+    disorder: I64,
+    age: float,
+    state: F64,
+    codes: I64,
+) -> int:
     """Fill state and codes and count on in `last`; return the reports' bits, -1 (and leave `last`) if not whole."""
     n, report = len(can_id), 0
     for i in range(n):

@@ -65,9 +65,11 @@ def measured(e: Estimate, x: F64, v: F64, age: float, noise: Noise) -> tuple[Est
     keep = np.eye(3) - K @ H
     P = keep @ e.P @ keep.T + K @ R @ K.T  # Joseph: stays symmetric
     new = e._replace(
-        x=e.x + K[0, 0] * dx + K[0, 1] * dv, v=e.v + K[1, 0] * dx + K[1, 1] * dv, b=e.b + K[2, 0] * dx + K[2, 1] * dv,
+        x=e.x + K[0, 0] * dx + K[0, 1] * dv,
+        v=e.v + K[1, 0] * dx + K[1, 1] * dv,
+        b=e.b + K[2, 0] * dx + K[2, 1] * dv,
         P=P,
-    )  # fmt: skip
+    )
     return new, float(np.hypot(dx[0], dx[1]))
 
 

@@ -83,17 +83,34 @@ def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, now: int, obstacles
     f = base.field
     push, rho_seen = _seen(points, base.point_radius, v, seen, now, f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d)
     told = _told(
-        points, base.point_radius, v, obstacles, base.margins.height,
-        f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d, f.look_ahead,
-    )  # fmt: skip
+        points,
+        base.point_radius,
+        v,
+        obstacles,
+        base.margins.height,
+        f.rho0,
+        f.rho_min,
+        f.rho_num,
+        f.eta,
+        f.k_d,
+        f.look_ahead,
+    )
     return Push(push, told[0], rho_seen, told[1], told[2], told[3])
 
 
 @kernel
 def _seen(
-    points: F64, radius: F64, v: F64, seen: F64, now: int,
-    rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float,
-) -> tuple[F64, float]:  # fmt: skip
+    points: F64,
+    radius: F64,
+    v: F64,
+    seen: F64,
+    now: int,
+    rho0: float,
+    rho_min: float,
+    rho_num: float,
+    eta: float,
+    k_d: float,
+) -> tuple[F64, float]:
     """Return (push (2,), rho) of a union of returns.
 
     A surface comes as many returns: their sum would grow with the sensor's resolution. The union's magnitude is that
@@ -124,9 +141,18 @@ def _seen(
 
 @kernel
 def _told(
-    points: F64, radius: F64, v: F64, obstacles: Obstacles, height: float,
-    rho0: float, rho_min: float, rho_num: float, eta: float, k_d: float, look_ahead: float,
-) -> tuple[F64, F64, F64, F64]:  # fmt: skip
+    points: F64,
+    radius: F64,
+    v: F64,
+    obstacles: Obstacles,
+    height: float,
+    rho0: float,
+    rho_min: float,
+    rho_num: float,
+    eta: float,
+    k_d: float,
+    look_ahead: float,
+) -> tuple[F64, F64, F64, F64]:
     """Return (push (K, 2), rho (K,), closing (K,), normal (K, 2)); the nearest point of the footprint is pushed."""
     slots, m = obstacles.active.shape[0], points.shape[0]
     P, out = np.empty((3, m)), np.zeros((slots, 4, m))

@@ -108,9 +108,19 @@ def _timed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> frozense
 def _entered(m: BaseMemory) -> BaseMemory:
     """Return the memory on entering a state: every motion begins from rest or from what is."""
     m = m._replace(
-        goal=None, status=Status.NO_GOAL, blocker=-1, still=0, off=False, held=False,
-        way=path.NO_WAY, nearest=np.inf, blind=0, asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2),
-    )  # fmt: skip
+        goal=None,
+        status=Status.NO_GOAL,
+        blocker=-1,
+        still=0,
+        off=False,
+        held=False,
+        way=path.NO_WAY,
+        nearest=np.inf,
+        blind=0,
+        asked=np.zeros(2),
+        did=np.zeros(2),
+        idle=np.zeros(2),
+    )
     if m.state == State.ARMED:
         m = m._replace(v_ref=np.zeros(2), v=0.0, w=0.0, entered=False, mine=False)
     return m

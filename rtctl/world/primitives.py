@@ -208,9 +208,18 @@ def copied(obstacles: Obstacles) -> Obstacles:
     """Return the same obstacles in arrays of their own."""
     o = obstacles
     return Obstacles(
-        o.kind.copy(), o.active.copy(), o.R.copy(), o.p.copy(), o.v.copy(), o.w.copy(), o.dims.copy(), o.group.copy(),
-        o.margin.copy(), o.mesh, o.clouds,
-    )  # fmt: skip
+        o.kind.copy(),
+        o.active.copy(),
+        o.R.copy(),
+        o.p.copy(),
+        o.v.copy(),
+        o.w.copy(),
+        o.dims.copy(),
+        o.group.copy(),
+        o.margin.copy(),
+        o.mesh,
+        o.clouds,
+    )
 
 
 def advance(obstacles: Obstacles, dt: float) -> Obstacles:

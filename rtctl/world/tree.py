@@ -252,9 +252,20 @@ def _side(body: F64, o: int, item: int, x: float, y: float, z: float) -> tuple[f
 
 @kernel
 def _measure(
-    P: F64, radius: F64, R: F64, p: F64, k: int, j: int, body: F64, o: int, grown: float, limit: float,
-    nodes: I64, keys: F64, out: F64,
-) -> None:  # fmt: skip
+    P: F64,
+    radius: F64,
+    R: F64,
+    p: F64,
+    k: int,
+    j: int,
+    body: F64,
+    o: int,
+    grown: float,
+    limit: float,
+    nodes: I64,
+    keys: F64,
+    out: F64,
+) -> None:
     """Write distance and normal of point j; where all is farther than `limit` [m], that limit, a lower bound."""
     dx, dy, dz = P[0, j] - p[k, 0], P[1, j] - p[k, 1], P[2, j] - p[k, 2]
     x = dx * R[k, 0, 0] + dy * R[k, 1, 0] + dz * R[k, 2, 0]

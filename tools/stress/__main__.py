@@ -42,8 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"stress: {error}", file=sys.stderr)
         return error.exit_code
     print(table(results))
-    print(f"{len(results)} scenarios, {sum(s.duration for s, _ in results):.0f} s simulated in "
-          f"{time.monotonic() - begun:.0f} s")  # fmt: skip
+    print(
+        f"{len(results)} scenarios, {sum(s.duration for s, _ in results):.0f} s simulated in "
+        f"{time.monotonic() - begun:.0f} s"
+    )
     if args.json:
         rows = [{**plain(s), "failures": f} for s, f in results]
         args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

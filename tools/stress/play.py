@@ -165,17 +165,33 @@ def _seen(servo: ArmServo, watch: Watch, name: str, index: int) -> Seen:
     arrived = bool(figures["arrived"])
     wrong = "" if arrived or contact is not None else diagnosis(servo, watch, status, detail)
     return Seen(
-        robot=name, case=index, duration=watch.ticks * robot.dt, arrived=arrived,
+        robot=name,
+        case=index,
+        duration=watch.ticks * robot.dt,
+        arrived=arrived,
         error=figures["final_error_m"] if figures["final_error_m"] is not None else np.inf,
-        contact=contact, retreat=retreat, can_retreat=can, finite=watch.finite,
-        torque=figures["max_torque_ratio"], rate=figures["max_torque_rate_ratio"],
-        joint_speed=figures["max_joint_speed_ratio"], tip_speed=float(whole[:, 2].max()),
-        margin=figures["min_joint_margin_rad"], clearance=min(watch.clearance.values(), default=np.inf),
-        own=watch.own, recent_torque=float(recent[:, 0].max()), recent_speed=float(recent[:, 1].max()),
+        contact=contact,
+        retreat=retreat,
+        can_retreat=can,
+        finite=watch.finite,
+        torque=figures["max_torque_ratio"],
+        rate=figures["max_torque_rate_ratio"],
+        joint_speed=figures["max_joint_speed_ratio"],
+        tip_speed=float(whole[:, 2].max()),
+        margin=figures["min_joint_margin_rad"],
+        clearance=min(watch.clearance.values(), default=np.inf),
+        own=watch.own,
+        recent_torque=float(recent[:, 0].max()),
+        recent_speed=float(recent[:, 1].max()),
         recent_tip=float(recent[:, 2].max()),
-        stopped=m.reaction.name if m.reaction > Severity.NONE else "", faults=tuple(faults.names(servo.faults_seen)),
-        status=status, detail=detail, statuses=statuses, diagnosis=wrong, digest=servo.digest.hexdigest(),
-    )  # fmt: skip
+        stopped=m.reaction.name if m.reaction > Severity.NONE else "",
+        faults=tuple(faults.names(servo.faults_seen)),
+        status=status,
+        detail=detail,
+        statuses=statuses,
+        diagnosis=wrong,
+        digest=servo.digest.hexdigest(),
+    )
 
 
 def _retreat(robot: Robot, plant: Plant, contact: Contact) -> tuple[float, float]:

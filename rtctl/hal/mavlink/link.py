@@ -59,11 +59,16 @@ class Stack(NamedTuple):
 
 STACKS = {
     "ardupilot": Stack(
-        3, 15, (15.0, 0.0), (4.0, 0.0), False, 0.0,
+        3,
+        15,
+        (15.0, 0.0),
+        (4.0, 0.0),
+        False,
+        0.0,
         ("AVOID_ENABLE", "OA_TYPE", "PRX1_TYPE", "FS_GCS_ENABLE", "MAV_GCS_SYSID", "SYSID_MYGCS"),
     ),
     "px4": Stack(12, 6 << 16, (6.0, 0.0), (4.0, 3.0), True, PRESTREAM, ("COM_OF_LOSS_T", "COM_OBL_RC_ACT")),
-}  # fmt: skip
+}
 STREAMS = {  # name -> (message id, Hz)
     "LOCAL_POSITION_NED": (32, 50.0), "ATTITUDE": (30, 50.0), "ODOMETRY": (331, 50.0), "OBSTACLE_DISTANCE": (330, 10.0),
     "DISTANCE_SENSOR": (132, 10.0), "EKF_STATUS_REPORT": (193, 10.0), "ESTIMATOR_STATUS": (230, 10.0),
@@ -141,17 +146,44 @@ class MavLink:
         elif v.origin is None and self.talk.idle and now - self._origin_asked > ORIGIN:
             self._ask_for_origin(now)
         return BaseFeedback(
-            slot=slot, missed=missed, position=v.position, velocity=v.velocity, yaw=v.yaw, yaw_rate=v.yaw_rate,
-            position_age=now - v.position_at, attitude_age=now - v.attitude_at, fresh=v.fresh, reset=v.reset,
-            scan=scan.ranges, scan_start=scan.start, scan_step=scan.step, scan_reach=scan.reach,
-            scan_age=now - scan.at, scans=seen.fresh, sensor=scan.sensor, scan_offset=np.array(sensor.offset),
-            scan_wrong=seen.wrong, known_age=now - seen.known_at, beams=seen.beams_now(now),
-            beam_reach=seen.beam_reach, heartbeat_age=now - v.heartbeat_at,
-            uplink_age=0.0 if math.isnan(v.uplink_at) else now - v.uplink_at, fix_lost=v.fix_lost, quality=v.quality,
-            ours=v.mode == self.stack.ours, mode=max(v.mode, 0), armed=v.armed, reboots=v.reboots, healthy=v.healthy,
-            word=int(self._word), lost=self._lost, refused=self._refused, link=self.wire.flags(), lateness=lateness,
+            slot=slot,
+            missed=missed,
+            position=v.position,
+            velocity=v.velocity,
+            yaw=v.yaw,
+            yaw_rate=v.yaw_rate,
+            position_age=now - v.position_at,
+            attitude_age=now - v.attitude_at,
+            fresh=v.fresh,
+            reset=v.reset,
+            scan=scan.ranges,
+            scan_start=scan.start,
+            scan_step=scan.step,
+            scan_reach=scan.reach,
+            scan_age=now - scan.at,
+            scans=seen.fresh,
+            sensor=scan.sensor,
+            scan_offset=np.array(sensor.offset),
+            scan_wrong=seen.wrong,
+            known_age=now - seen.known_at,
+            beams=seen.beams_now(now),
+            beam_reach=seen.beam_reach,
+            heartbeat_age=now - v.heartbeat_at,
+            uplink_age=0.0 if math.isnan(v.uplink_at) else now - v.uplink_at,
+            fix_lost=v.fix_lost,
+            quality=v.quality,
+            ours=v.mode == self.stack.ours,
+            mode=max(v.mode, 0),
+            armed=v.armed,
+            reboots=v.reboots,
+            healthy=v.healthy,
+            word=int(self._word),
+            lost=self._lost,
+            refused=self._refused,
+            link=self.wire.flags(),
+            lateness=lateness,
             compute=compute,
-        )  # fmt: skip
+        )
 
     def _drain(self) -> None:
         self.view.cycle()

@@ -193,7 +193,7 @@ class _Copy:
         if whole and known.all() and single and len(found.channel):
             self.segment.flush()
             chunk = Chunk(head.compression, head.size, head.crc, raw)
-            self.segment.add_chunk(chunk, found.channel, found.sequence, found.stamp, found.offset)  # fmt: skip
+            self.segment.add_chunk(chunk, found.channel, found.sequence, found.stamp, found.offset)
             return
         self._again(content, found, np.flatnonzero(known))
         if not (whole and known.all()):

@@ -166,9 +166,14 @@ def _check(memory: Memory, template: Memory) -> None:
         raise ValueError("not a checkpoint: blocked_by")
     h = record_of(memory.hot)[0]
     kinds = {
-        "state": State, "reaction": Severity, "status": Status, "task": Task, "goal_task": Task, "hold_task": Task,
+        "state": State,
+        "reaction": Severity,
+        "status": Status,
+        "task": Task,
+        "goal_task": Task,
+        "hold_task": Task,
         "escape_phase": Phase,
-    }  # fmt: skip
+    }
     for name, kind in kinds.items():
         kind(int(h[name]))  # raises ValueError
     if not h["escape_ticks"] >= 0 or (h["escape_phase"] == Phase.CHOOSING and h["escape_ticks"] >= DIRECTIONS):

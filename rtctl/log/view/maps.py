@@ -43,9 +43,14 @@ def window_of(g: Gathered, goals: tuple[Goal, ...]) -> Window:
 
 
 def draw_map(
-    axes: Axes, g: Gathered, goals: tuple[Goal, ...], colours: Mapping[str, str], plane: tuple[int, int],
-    window: Window, title: str,
-) -> None:  # fmt: skip
+    axes: Axes,
+    g: Gathered,
+    goals: tuple[Goal, ...],
+    colours: Mapping[str, str],
+    plane: tuple[int, int],
+    window: Window,
+    title: str,
+) -> None:
     """Draw one view: `plane` are the world axes that go to the right and up."""
     across, up = plane
     low, high = window = _fitted(axes, window, plane)
@@ -68,8 +73,16 @@ def draw_map(
     for goal in goals:
         here, colour = np.array(goal.position)[list(plane)], RED if goal.reached is False else INK
         axes.plot(*here, "o", ms=17, mfc=PAPER, mec=colour, mew=1.8, zorder=8)
-        axes.text(*here, str(goal.number), ha="center", va="center_baseline", fontsize=10, fontweight="bold",
-                  color=colour, zorder=9)  # fmt: skip
+        axes.text(
+            *here,
+            str(goal.number),
+            ha="center",
+            va="center_baseline",
+            fontsize=10,
+            fontweight="bold",
+            color=colour,
+            zorder=9,
+        )
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(high[across], low[across])  # seen along x, y grows to the left
     axes.set_ylim(low[up], high[up])
@@ -82,8 +95,17 @@ def draw_map(
 
 def _label(axes: Axes, place: F64, text: str, offset: tuple[int, int], colour: str) -> None:
     box = {"fc": PAPER, "ec": "none", "alpha": 0.75, "pad": 0.8}
-    axes.annotate(text, place, xytext=offset, textcoords="offset points", ha="center", fontsize=9, color=colour,
-                  zorder=8, bbox=box)  # fmt: skip
+    axes.annotate(
+        text,
+        place,
+        xytext=offset,
+        textcoords="offset points",
+        ha="center",
+        fontsize=9,
+        color=colour,
+        zorder=8,
+        bbox=box,
+    )
 
 
 def _fitted(axes: Axes, window: Window, plane: tuple[int, int]) -> Window:
@@ -136,8 +158,17 @@ def _obstacle(axes: Axes, g: Gathered, way: Way, colour: str, plane: tuple[int, 
     if moves:  # below, where it hides no goal
         at = np.array([at[0], edge[:, 1].min()])
     box = {"fc": PAPER, "ec": colour, "alpha": 0.85, "pad": 1.6, "lw": 0.8}
-    axes.text(*np.clip(at, low, high), f"{way.name} at {time:.1f} s" if moves else way.name, ha="center",
-              va="center", fontsize=9.5, color=INK, zorder=6, style="italic", bbox=box)  # fmt: skip
+    axes.text(
+        *np.clip(at, low, high),
+        f"{way.name} at {time:.1f} s" if moves else way.name,
+        ha="center",
+        va="center",
+        fontsize=9.5,
+        color=INK,
+        zorder=6,
+        style="italic",
+        bbox=box,
+    )
 
 
 def _plane(axes: Axes, way: Way, colour: str, plane: tuple[int, int], window: Window) -> None:
@@ -150,8 +181,17 @@ def _plane(axes: Axes, way: Way, colour: str, plane: tuple[int, int], window: Wi
     corners = [point - 5.0 * along, point + 5.0 * along, point + 5.0 * (along - normal), point - 5.0 * (along + normal)]
     axes.add_patch(Polygon(corners, closed=True, fc=colour, ec=colour, alpha=0.35, lw=1.2, zorder=1))
     low, high = window[0][list(plane)] + 0.03, window[1][list(plane)] - 0.03
-    axes.text(high[0], np.clip(point - 0.03 * normal, low, high)[1], way.name, ha="left", va="center", fontsize=9.5,
-              color=INK, zorder=6, style="italic")  # fmt: skip
+    axes.text(
+        high[0],
+        np.clip(point - 0.03 * normal, low, high)[1],
+        way.name,
+        ha="left",
+        va="center",
+        fontsize=9.5,
+        color=INK,
+        zorder=6,
+        style="italic",
+    )
 
 
 def _ghosts(way: Way, window: Window) -> list[list[float]]:

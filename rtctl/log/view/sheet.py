@@ -81,9 +81,11 @@ def _completed(g: Gathered, notes: Notes) -> Notes:
     )
     goals = tuple(Goal(k, tuple(p), at) for k, (p, at) in enumerate(zip(g.goals, g.asked, strict=True), start=1))
     return notes._replace(
-        title=notes.title or g.header.robot, words=notes.words or words, goals=notes.goals or goals[:30],
+        title=notes.title or g.header.robot,
+        words=notes.words or words,
+        goals=notes.goals or goals[:30],
         lockstep=notes.lockstep or g.lateness.largest == 0.0,
-    )  # fmt: skip
+    )
 
 
 def _shrink(path: Path) -> None:
@@ -123,9 +125,16 @@ def _instants(axes: Any, g: Gathered, notes: Notes, numbered: bool) -> None:
     for goal in notes.goals:
         axes.axvline(goal.at, color="#CFCFCF", lw=1.0, zorder=0)
         if numbered:
-            axes.annotate(str(goal.number), (goal.at, 1.0), xycoords=("data", "axes fraction"), xytext=(4, -12),
-                          textcoords="offset points", fontsize=10, fontweight="bold",
-                          color=RED if goal.reached is False else INK)  # fmt: skip
+            axes.annotate(
+                str(goal.number),
+                (goal.at, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(4, -12),
+                textcoords="offset points",
+                fontsize=10,
+                fontweight="bold",
+                color=RED if goal.reached is False else INK,
+            )
 
 
 def _error(axes: Any, g: Gathered, notes: Notes) -> None:

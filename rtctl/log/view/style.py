@@ -52,11 +52,31 @@ def level(axes: Any, value: float, text: str, colour: str) -> None:
     """Draw a level and name it at the right end of the axes."""
     axes.axhline(value, color=colour, lw=1.2, ls="--")
     box = {"fc": PAPER, "ec": "none", "alpha": 0.8, "pad": 0.6}
-    axes.annotate(text, (1.0, value), xycoords=("axes fraction", "data"), xytext=(-3, 3.5), textcoords="offset points",
-                  ha="right", va="bottom", fontsize=9, color=colour, bbox=box, zorder=9)  # fmt: skip
+    axes.annotate(
+        text,
+        (1.0, value),
+        xycoords=("axes fraction", "data"),
+        xytext=(-3, 3.5),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        fontsize=9,
+        color=colour,
+        bbox=box,
+        zorder=9,
+    )
 
 
 def legend(axes: Any, columns: int) -> None:
     """Put the names of the lines above the axes, at the right."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.005, 0.985), ncols=columns, fontsize=9, frameon=False,
-                handlelength=1.4, columnspacing=1.1, handletextpad=0.5, borderaxespad=0.1)  # fmt: skip
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.005, 0.985),
+        ncols=columns,
+        fontsize=9,
+        frameon=False,
+        handlelength=1.4,
+        columnspacing=1.1,
+        handletextpad=0.5,
+        borderaxespad=0.1,
+    )

@@ -132,11 +132,23 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     events = [_event(e) for e in run.events]
     bus = {name: _bus_load(run, name, header) for name in run.topics if name.startswith(schema.can_topic(""))}
     return Gathered(
-        header, bins, lateness, compute, spectrum, states.done(period), statuses.done(period), faults.done(period),
-        cuts.done(period), list(slots.ways.values()), slots.goals,
+        header,
+        bins,
+        lateness,
+        compute,
+        spectrum,
+        states.done(period),
+        statuses.done(period),
+        faults.done(period),
+        cuts.done(period),
+        list(slots.ways.values()),
+        slots.goals,
         np.interp(slots.asked, *np.array(marks, np.float64).T).tolist() if slots.asked else [],
-        limits, figures.as_dict(), bus, events,
-    )  # fmt: skip
+        limits,
+        figures.as_dict(),
+        bus,
+        events,
+    )
 
 
 def _fill(bins: Bins, r: Structured, header: Header, limits: dict[str, F64]) -> None:
