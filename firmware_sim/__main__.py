@@ -184,7 +184,7 @@ def hasten() -> None:
     On a single core this process could keep everything else from running, so there it does not ask.
     """
     gc.disable()
-    if len(os.sched_getaffinity(0)) > 1:
+    if (os.cpu_count() or 1) > 1:  # of the machine: this process may well be bound to one of them
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
 

@@ -63,7 +63,7 @@ def test_it_allows_its_link_and_nothing_else():
     assert ports == shipped
     assert keys["DevicePolicy"] == ["closed"]
     lines = {device.split()[0] for device in keys["DeviceAllow"]}
-    assert lines == {f"char-tty{kind}" for kind in ("ACM", "USB", "AMA", "THS", "S")}
+    assert lines == {f"char-tty{kind}" for kind in ("ACM", "USB", "AMA", "THS", "S")} | {"/dev/cpu_dma_latency"}
     assert keys["CapabilityBoundingSet"] == keys["AmbientCapabilities"] == [""]
 
 

@@ -5,10 +5,12 @@ import errno
 import gc
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
 from itertools import islice, pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -16,7 +18,7 @@ from hypothesis import strategies as st
 
 from rtctl.errors import EXIT_CONFIG, ConfigError
 from rtctl.hal import clock
-from rtctl.hal.clock import Slot, grid, lockstep, realtime, sleep_until
+from rtctl.hal.clock import Slot, grid, light_sleep, lockstep, realtime, sleep_until
 
 PERIOD = 0.001
 STEP = 1_000_000
@@ -213,3 +215,24 @@ def test_a_real_process_gets_what_it_may_and_says_the_rest() -> None:
         "assert not gc.isenabled(); assert gc.get_freeze_count() > 0"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_the_wish_for_light_sleep_is_held_as_long_as_it_lasts(tmp_path: Path) -> None:
+    device = tmp_path / "latency"
+    device.touch()
+    with light_sleep(device) as refused:
+        assert refused == ""
+        assert device.read_bytes() == struct.pack("=i", 0)  # [us]; what the kernel's interface takes
+        held = [os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if _open(fd)]
+        assert str(device) in held
+    assert str(device) not in [os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if _open(fd)]
+
+
+def _open(fd: str) -> bool:
+    return os.path.lexists(f"/proc/self/fd/{fd}")
+
+
+def test_who_may_not_wish_goes_on_and_says_why(tmp_path: Path) -> None:
+    with light_sleep(tmp_path / "absent") as refused:
+        assert "absent" in refused
+        assert os.strerror(errno.ENOENT) in refused

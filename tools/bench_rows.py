@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.hal import clock
 from rtctl.types import F64, I64
 
 PRIORITY = 80
@@ -50,6 +51,7 @@ def urgent() -> Iterator[str]:
         yield f"SCHED_OTHER ({error.strerror})"
         return
     try:
-        yield f"SCHED_FIFO {PRIORITY}"
+        with clock.light_sleep():
+            yield f"SCHED_FIFO {PRIORITY}"
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -169,7 +169,8 @@ def probed(period: float) -> str:
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     try:
-        slots = list(islice(clock.grid(period), round(PROBE_S / period)))
+        with clock.light_sleep():
+            slots = list(islice(clock.grid(period), round(PROBE_S / period)))
     finally:
         os.sched_setscheduler(0, *before)
     late = sorted(each.lateness for each in slots)[len(slots) * 99 // 100]

@@ -89,7 +89,7 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool,
         servo = Servo(vehicle, robot, link, recorder, start, dry)
         console.publish(lambda: status(servo, recorder), lambda: world(servo))
         if not lockstep:
-            _scheduled(setup.loop)
+            _scheduled(setup.loop, stack.enter_context(clock.light_sleep()))
         service = stack.enter_context(closing(Service(robot.dt)))
         service.ready(f"{robot.name}: IDLE")
         say(f"rtctl: ready, log {recorder.stats().path}")
@@ -111,10 +111,13 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool,
     return code
 
 
-def _scheduled(loop: Loop) -> None:
-    """Take the real-time rights that the config asks for; say what was refused. Raises RtctlError if required."""
+def _scheduled(loop: Loop, sleeps: str) -> None:
+    """Take the real-time rights that the config asks for; say what was refused. Raises RtctlError if required.
+
+    sleeps: why the cores sleep deeply, "" if they do not. It makes turns late, not wrong: never a reason to refuse.
+    """
     granted = clock.realtime(loop.realtime, -1 if loop.cpu is None else loop.cpu, loop.priority)
-    for refusal in granted.refused:
+    for refusal in (*granted.refused, *([sleeps] if sleeps else [])):
         say(f"rtctl: best effort: {refusal}")
 
 

@@ -270,6 +270,7 @@ def warm(robot: Robot) -> None:
         moving = m._replace(state=State.RUN, goal=goal, in_force=0)
         beside, _, _ = tick(robot, moving, feedback, Request(obstacles=edits))
         tick(robot, beside, feedback, Request(goal=goal, verb=Verb.RESET))  # the obstacles move on by themselves
+        tick(robot, beside, feedback, Request(obstacles=edits[:1]))  # and when others are told
     _warm_competence(robot, moving, feedback)
     quat_of(exp3(between(TOOL_Z, -TOOL_Z)))  # of a goal that names a direction
     stopping = m._replace(state=State.SAFE_STOP, reaction=Severity.SS1)

@@ -9,11 +9,14 @@ import gc
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 from rtctl.errors import ConfigError
 
 NS = 1_000_000_000
+LATENCY = Path("/dev/cpu_dma_latency")  # root's, unless a rule of udev says otherwise
 _TIMER_ABSTIME = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -102,6 +105,26 @@ def realtime(mode: str, cpu: int = -1, priority: int = 80, place: str = "loop.re
         raise ConfigError(place, "; ".join(refused), 'these rights, or realtime = "best-effort"')
     quiet_collector()
     return RealTime(scheduler, memory, affinity, tuple(refused))
+
+
+@contextmanager
+def light_sleep(device: Path = LATENCY) -> Iterator[str]:
+    """Keep the cores from sleep that takes long to wake from, as far as it is allowed; give the reason if it is not.
+
+    An idle core sleeps the deeper the longer it expects to, and a turn then begins up to 0.1 ms late. The kernel keeps
+    to the lowest latency [us] that anybody has written to the device and holds open (its quality-of-service interface
+    for power management), so the wish ends with the process, however it ends.
+    """
+    try:
+        wish = os.open(device, os.O_WRONLY)
+    except OSError as error:
+        yield f"light sleep of the cores ({device}): {os.strerror(error.errno or 0)}"
+        return
+    try:
+        os.write(wish, bytes(4))
+        yield ""
+    finally:
+        os.close(wish)
 
 
 def quiet_collector() -> None:
