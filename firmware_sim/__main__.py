@@ -21,6 +21,7 @@ from firmware_sim.codec import REGISTER_ID
 from firmware_sim.drive import NS
 from firmware_sim.inject import KINDS
 from firmware_sim.kernel import cold
+from firmware_sim.reality import plant_table
 from firmware_sim.report import Report
 from firmware_sim.rover import is_rover, open_rover
 from firmware_sim.rover_serve import serve
@@ -199,6 +200,7 @@ def arguments(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("config", help="robot file (TOML)")
     parser.add_argument("--scenario", help="obstacles, faults and start of a scenario file (TOML)")
+    parser.add_argument("--plant", metavar="FILE", help="how the arm differs from its description: [plant] of a file")
     parser.add_argument("--lockstep", action="store_true", help="time follows the commands instead of the wall clock")
     parser.add_argument("--camera", metavar="SOCKET", help="tell the scenario's obstacles to this control socket")
     parser.add_argument("--report", metavar="FILE", help="JSON of clearances, contacts, trips; renewed twice a second")
@@ -229,6 +231,8 @@ def _scenario(path: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> None:
     """Open everything, serve until a signal, write the report."""
     scenario = _scenario(args.scenario)
+    if args.plant:
+        scenario["plant"] = plant_table(args.plant)
     if is_rover(args.config):
         serve(open_rover(args.config, scenario, args.inject, not args.now, args.seed), args.config, args.report)
         return

@@ -100,7 +100,7 @@ class Injector:
 
     def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
         self.faults = list(faults)
-        self.random = random.Random(seed)
+        self.seed, self.random = seed, random.Random(seed)
         self.done: set[int] = set()
         self.stuck: dict[int, tuple[float, float]] = {}
 

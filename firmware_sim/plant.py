@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from firmware_sim.bullet import pb, silent
 from firmware_sim.drive import NS
+from firmware_sim.friction import Joints
 from firmware_sim.obstacles import Obstacles
 from firmware_sim.oracle import Arm, Contact, Oracle, State
+from firmware_sim.reality import Reality, reality_of
 from firmware_sim.settings import Settings, SettingsError
 from firmware_sim.shapes import solid
-from firmware_sim.urdf import rewrite
+from firmware_sim.urdf import rewrite, urdf_dynamics
 
 F64 = NDArray[np.float64]
 GRAVITY = 9.81  # [m/s^2]
@@ -34,14 +36,22 @@ __all__ = ["Contact", "Plant"]
 class Plant:
     """Owns a pybullet world: the arm, the obstacles, and time. Deterministic: no threads, no randomness."""
 
-    def __init__(self, settings: Settings, start_q: Sequence[float] | F64, obstacles: Sequence[dict[str, Any]]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        start_q: Sequence[float] | F64,
+        obstacles: Sequence[dict[str, Any]],
+        reality: Reality | None = None,
+    ) -> None:
+        """`reality`: how it differs from its description, None: in nothing."""
         self.settings = settings
+        self.reality = reality_of({}, settings) if reality is None else reality
         self.client = pb.connect(pb.DIRECT)
         n_steps = -(-settings.period_ns // STEP_NS)
         self.step_ns = settings.period_ns // n_steps
         self.substeps = n_steps
         self._engine()
-        urdf = rewrite(settings)
+        urdf = rewrite(settings, self.reality)
         self.body = self._load(urdf)
         self._identify()
         self._inertias(urdf)
@@ -120,8 +130,13 @@ class Plant:
             pb.setJointMotorControl2(self.body, i, pb.VELOCITY_CONTROL, force=0.0, physicsClientId=self.client)
         self.armature = np.array([j.armature for j in self.settings.joints])
         self._rotors = np.diag(self.armature)
-        self.friction = np.array([j.friction for j in self.settings.joints])
-        self.motors = bool(self.armature.any() or self.friction.any())
+        viscous, coulomb = urdf_dynamics(self.settings, self.reality)
+        self.friction = np.array([j.friction for j in self.settings.joints]) + viscous
+        self.joints = Joints(
+            self.reality._replace(coulomb=tuple(coulomb), static=tuple(np.maximum(coulomb, self.reality.static))),
+            [r.torque for r in self.settings.ratings],
+        )
+        self.motors = bool(self.armature.any() or self.friction.any() or self.joints.rubs)
 
     def _inertias(self, urdf: str) -> None:
         """Give links the tensor of the URDF where pybullet replaced it by zero.
@@ -165,6 +180,8 @@ class Plant:
 
         Drag is a velocity motor towards zero speed with a bounded force: it brakes and holds, and never drives.
         """
+        if not self.joints.ideal:
+            torque, drag = self.joints.given(torque, drag)
         if self.motors:
             torque = self._with_motors(torque)
         pb.setJointMotorControlArray(
@@ -179,11 +196,14 @@ class Plant:
     def _with_motors(self, torque: Sequence[float]) -> list[float]:
         """Return the torques that move the arm as if each joint also carried its motor's inertia and friction.
 
-        (A + diag(J G^2)) qdd = tau - B G^2 qd - h - g; pybullet, which knows A alone, gets tau - B G^2 qd - J G^2 qdd.
+        (A + diag(J G^2)) qdd = tau - B G^2 qd - f - h - g; pybullet, which knows A alone, gets tau - B G^2 qd - f -
+        J G^2 qdd. The friction f is that of `friction`.
         """
         A = np.array(pb.calculateMassMatrix(self.body, self.q, physicsClientId=self.client))
         bias = pb.calculateInverseDynamics(self.body, self.q, self.qd, [0.0] * len(self.q), physicsClientId=self.client)
         tau = np.asarray(torque, dtype=np.float64) - self.friction * np.array(self.qd)
+        if self.joints.rubs:
+            tau -= self.joints.rub(A + self._rotors, tau - np.array(bias), np.array(self.qd), self.step_ns / NS)
         qdd = np.linalg.solve(A + self._rotors, tau - np.array(bias))
         result: list[float] = (tau - self.armature * qdd).tolist()
         return result

@@ -18,9 +18,11 @@ from firmware_sim.cells import LARGEST, TORQUE
 from firmware_sim.drive import NS
 from firmware_sim.inject import Injector, faults_of, parse
 from firmware_sim.plant import Plant
+from firmware_sim.reality import Reality, braked, reality_of
 from firmware_sim.rover import is_rover, open_rover
 from firmware_sim.settings import Settings, SettingsError, load
 from firmware_sim.shapes import ObstacleEdit, reported, shape_at
+from firmware_sim.traffic import Traffic
 from firmware_sim.wire import Wire, of_registers
 
 F64 = NDArray[np.float64]
@@ -51,14 +53,19 @@ class Simulator:
         obstacles: Sequence[dict[str, Any]],
         injector: Injector,
         wait: bool = False,
+        reality: Reality | None = None,
     ) -> None:
-        """`wait`: the scenario's clock (obstacles, faults) stands at 0 until a drive is enabled."""
+        """`wait`: the scenario's clock (obstacles, faults) is 0 until a drive is enabled; `reality`: see `Plant`."""
         self.settings = settings
-        self.bank = Bank(settings.ratings, settings.fd)
+        self.reality = reality_of({}, settings) if reality is None else reality
+        rows = zip(settings.ratings, braked(self.reality), strict=True)
+        self.bank = Bank([r if brake else r._replace(release_ns=0) for r, brake in rows], settings.fd)
         self.drives = self.bank.drives
         self.injector = injector
-        self.wire = Wire(self.bank, injector, settings.fd)
-        self.plant = Plant(settings, start_q, obstacles)
+        real = self.reality
+        traffic = Traffic(real.reply_loss, real.reply_late, real.talkers, settings.fd, injector.seed)
+        self.wire = Wire(self.bank, injector, settings.fd, traffic)
+        self.plant = Plant(settings, start_q, obstacles, self.reality)
         self.started = not wait
         self.exact = True  # whether every truth tells exact clearances; else their least over the run alone are exact
         self._size = frozenset((self.bank.size,))
@@ -119,7 +126,8 @@ class Simulator:
             self._truth = None
 
     def _sense(self) -> None:
-        q, qd, now = self.plant.q, self.plant.qd, self.plant.scene_ns
+        now = self.plant.scene_ns
+        q, qd = self.plant.joints.read(self.plant.q, self.plant.qd)
         if self.injector.quiet(now):
             self.bank.sense(q, qd)
             return
@@ -187,4 +195,5 @@ def open_simulator(
     names = [j.name for j in settings.joints]
     faults = [*faults_of(play.get("fault", ()), names), *(parse(text, names) for text in inject)]
     obstacles = [*settings.obstacles, *play.get("obstacle", ())]
-    return Simulator(settings, q, obstacles, Injector(faults, int(play.get("seed", seed))), wait)
+    reality = reality_of(play.get("plant") or {}, settings)
+    return Simulator(settings, q, obstacles, Injector(faults, int(play.get("seed", seed))), wait, reality)

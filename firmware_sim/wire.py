@@ -10,14 +10,15 @@ from firmware_sim.bank_kernels import AGAIN, ALL_READ, EVERYBODY, UNCOMMON
 from firmware_sim.batch import Batch
 from firmware_sim.cells import COMMANDED
 from firmware_sim.inject import Injector
+from firmware_sim.traffic import SILENT, Traffic
 from rtctl.protocol import frame
 
 
 class Wire:
     """Routes frames by their identifier; owns nothing."""
 
-    def __init__(self, bank: Bank, injector: Injector, fd: bool) -> None:
-        self.bank, self.injector, self.fd = bank, injector, fd
+    def __init__(self, bank: Bank, injector: Injector, fd: bool, traffic: Traffic = SILENT) -> None:
+        self.bank, self.injector, self.fd, self.traffic = bank, injector, fd, traffic
         self.drives = bank.drives
         self.by_id = {d.rating.motor: k for k, d in enumerate(self.drives)}
 
@@ -27,7 +28,7 @@ class Wire:
         now: [ns] on the scenario's clock. clocked: stop before a second frame to a drive within a period (AGAIN), and
         once every drive has had one (EVERYBODY). Returns the next frame, and why it stopped there: else ALL_READ.
         """
-        at, quiet = first, self.injector.quiet(now)
+        at, quiet = first, self.traffic.quiet and self.injector.quiet(now)
         while at < came.count:
             if quiet:
                 at, why = self.bank.answer(came, replies, at, clocked)
@@ -73,11 +74,12 @@ class Wire:
         return self._sent(now, k, self.drives[k].register(data)) if k >= 0 else []
 
     def _sent(self, now: int, k: int, reply: bytes | None) -> list[bytes]:
-        """Return a drive's reply as frames on the bus, after whatever the injector does to it."""
+        """Return a drive's reply as frames on the bus, after whatever injector and traffic do to it."""
         if reply is None:
             return []
         can_id = int(self.drives[k].registers[codec.MST_ID])
-        return [frame.pack(can_id, p, fd=self.fd, brs=self.fd) for p in self.injector.reply(now, k, reply)]
+        sent = [frame.pack(can_id, p, fd=self.fd, brs=self.fd) for p in self.injector.reply(now, k, reply)]
+        return sent if self.traffic.quiet else self.traffic.carried(k, sent)
 
 
 def of_registers(raw: bytes) -> bool:

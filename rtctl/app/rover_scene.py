@@ -139,6 +139,8 @@ class RoverPlay:
 
 def open_play(config: BaseConfig, path: Path, base: Base, scenario: Scenario, source: Path) -> RoverPlay:
     """Return a scenario of the file `source` and the rover that plays it. Raises RtctlError."""
+    if scenario.plant is not None:
+        raise ConfigError(f"{source}: plant", "a table", "nothing: that is for arms")
     if scenario.start_q_rad is not None:
         raise ConfigError(f"{source}: start_q_rad", "angles", "nothing: a base has start_pose")
     rover = cast(RoverSimulator, open_simulator(path, scenario, source))

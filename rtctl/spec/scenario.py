@@ -19,6 +19,7 @@ from rtctl.spec.obstacles import (
     refuse_obstacles,
     shape_of,
 )
+from rtctl.spec.plant import PlantTable
 from rtctl.spec.read import convert, name_place, read
 from rtctl.spec.robot import Angle, Angles, Key, Table, Text
 from rtctl.types import F64, Goal, ObstacleEdit
@@ -74,6 +75,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     goal: Annotated[tuple[TimedGoal, ...], Meta(max_length=10_000)] = ()
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
     fault: Annotated[tuple[FaultTable, ...], Meta(max_length=1000)] = ()
+    plant: PlantTable | None = None  # None: the simulated arm is as described
 
 
 def load_scenario(path: str | Path) -> Scenario:
