@@ -251,29 +251,29 @@ def test_segments_end():
 # ---- no action when the command is too large
 
 
-def too_much_is_cut_and_still_brakes(permit: Callable[..., limits.Permitted]) -> bool:
+def too_much_is_limited_and_still_brakes(limit: Callable[..., limits.Limited]) -> bool:
     """A joint at speed, a brake that must be kept, and a drive that wants far more than there is."""
     arm = robot()
     qd = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
     keep = -0.5 * arm.tau_max * np.sign(qd)
-    brakes = True
+    bounds, brakes = limits.TorqueBounds(arm.tau_max, arm.tau_rate, arm.tau_lsb, arm.stop.damping), True
     for drive in (np.full(7, 1e6), -np.full(7, 1e6), 1e6 * qd):
-        tau = permit(drive, keep, qd, keep, arm.tau_max, arm.tau_rate, arm.stop.damping, arm.dt).tau
+        tau = limit(limits.TorqueParts(drive, keep), qd, keep, bounds, arm.dt).tau
         brakes = brakes and bool((np.abs(tau) <= arm.tau_max).all() and (tau * qd).sum() < 0.0 and tau.any())
         # the reference is the brake itself: within one step of it nothing is given away
         brakes = brakes and bool((np.abs(tau - keep) <= arm.tau_rate * arm.dt * (1 + 1e-9)).all())
     return brakes
 
 
-def all_or_nothing(drive: F64, keep: F64, *arguments: Any) -> limits.Permitted:
-    wanted = drive + keep
+def all_or_nothing(torque: limits.TorqueParts, *arguments: Any) -> limits.Limited:
+    wanted = torque.drive + torque.keep
     tau = wanted if (np.abs(wanted) <= robot().tau_max).all() else np.zeros(7)
-    return limits.Permitted(wanted, tau, 0, 1.0)
+    return limits.Limited(wanted, tau, 0, 1.0)
 
 
 def test_a_command_that_is_too_large_still_brakes():
-    assert too_much_is_cut_and_still_brakes(limits.permit)
-    assert not too_much_is_cut_and_still_brakes(all_or_nothing)
+    assert too_much_is_limited_and_still_brakes(limits.limit_torque)
+    assert not too_much_is_limited_and_still_brakes(all_or_nothing)
 
 
 # ---- no torque at exit

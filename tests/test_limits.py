@@ -1,4 +1,4 @@
-"""The permitter's promises, whatever it is handed."""
+"""The limiter's promises, whatever it is handed."""
 
 import numpy as np
 import pytest
@@ -6,18 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rtctl.arm.limits import permit, slew_reference
+from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
 from rtctl.types import Cut
 
 N, DT = 3, 1e-3
 MAX, RATE, D = np.array([80.0, 40.0, 10.0]), np.array([1000.0, 1000.0, 300.0]), np.array([10.0, 5.0, 1.0])
+BOUNDS = TorqueBounds(MAX, RATE, np.zeros(N), D)
 anything = arrays(np.float64, N, elements=st.floats(allow_nan=True, allow_infinity=True, width=64))
 sane = arrays(np.float64, N, elements=st.floats(-200.0, 200.0))
 
 
 @given(anything, anything, anything, sane)
 def test_what_leaves_is_finite_within_magnitude_and_slew_whatever_comes_in(drive, keep, qd, reference):
-    p = permit(drive, keep, qd, reference, MAX, RATE, D, DT)
+    p = limit_torque(TorqueParts(drive, keep), qd, reference, BOUNDS, DT)
     assert np.isfinite(p.tau).all()
     assert (np.abs(p.tau) <= MAX).all()
     start = np.clip(reference, -MAX, MAX)
@@ -26,7 +27,7 @@ def test_what_leaves_is_finite_within_magnitude_and_slew_whatever_comes_in(drive
 
 @given(anything)
 def test_a_torque_reference_that_is_not_finite_gives_zero_torque_there(reference):
-    p = permit(np.ones(N), np.zeros(N), np.zeros(N), reference, MAX, RATE, D, DT)
+    p = limit_torque(TorqueParts(np.ones(N), np.zeros(N)), np.zeros(N), reference, BOUNDS, DT)
     bad = ~np.isfinite(reference)
     assert (p.tau[bad] == 0.0).all()
     assert bool(p.cut & Cut.NON_FINITE) == bool(bad.any())
@@ -38,7 +39,7 @@ def test_one_bad_number_damps_every_joint(bad, where):
     parts = {"drive": np.ones(N), "keep": np.ones(N)}
     parts[where][1] = bad
     qd = np.array([0.1, -0.1, 0.01])
-    p = permit(parts["drive"], parts["keep"], qd, -D * qd, MAX, RATE, D, DT)
+    p = limit_torque(TorqueParts(**parts), qd, -D * qd, BOUNDS, DT)
     assert p.cut & Cut.NON_FINITE
     np.testing.assert_allclose(p.tau, [-1.0, 0.5, -0.01])
 
@@ -46,7 +47,7 @@ def test_one_bad_number_damps_every_joint(bad, where):
 @given(sane, sane)
 def test_motion_gives_way_before_what_must_be_kept(drive, keep):
     keep = np.clip(keep, -MAX, MAX)
-    p = permit(drive, keep, np.zeros(N), keep, MAX, np.full(N, 1e9), D, DT)
+    p = limit_torque(TorqueParts(drive, keep), np.zeros(N), keep, BOUNDS._replace(tau_rate=np.full(N, 1e9)), DT)
     # the drive is scaled as one: tau - keep stays parallel to it, by the largest factor in [0, 1] that fits
     np.testing.assert_allclose(p.tau, keep + p.scale * drive, atol=1e-9)
     more = min(1.0, p.scale + 1e-6)
@@ -55,7 +56,7 @@ def test_motion_gives_way_before_what_must_be_kept(drive, keep):
 
 @given(arrays(np.float64, N, elements=st.floats(-9.0, 9.0)))
 def test_a_torque_within_all_bounds_is_not_touched(tau):
-    p = permit(tau, np.zeros(N), np.zeros(N), tau, MAX, RATE, D, DT)
+    p = limit_torque(TorqueParts(tau, np.zeros(N)), np.zeros(N), tau, BOUNDS, DT)
     np.testing.assert_array_equal(p.tau, tau)
     assert p.cut == 0
 

@@ -28,7 +28,7 @@ from rtctl.app.vehicle import (
     clearances,
 )
 from rtctl.arm import faults, task
-from rtctl.arm.limits import permit, slew_reference
+from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial, tick, warm
 from rtctl.arm.robot import Robot
@@ -116,9 +116,10 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
 def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slot], lockstep: bool) -> None:
     """A turn raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
 
-    -D qd + g through the permitter, from the feedback alone: nothing of the tick that failed is used.
+    -D qd + g through the limiter, from the feedback alone: nothing of the tick that failed is used.
     """
     g, sent, rest, driven, heard = m.model.g, m.sent[0], 0, True, True
+    bounds = TorqueBounds(robot.tau_max, robot.tau_rate, robot.tau_lsb, robot.stop.damping)
     for k, slot in enumerate(slots):
         feedback = link.read(slot.slot, slot.missed, slot.lateness, 0.0)
         sink.put_many(CAN_RX, link.received, time.monotonic_ns())
@@ -128,9 +129,7 @@ def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slo
             return
         keep = g - robot.stop.damping * feedback.qd
         reference = slew_reference(sent, feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, 1)
-        sent = permit(
-            np.zeros(robot.n), keep, feedback.qd, reference, robot.tau_max, robot.tau_rate, robot.stop.damping, robot.dt
-        ).tau
+        sent = limit_torque(TorqueParts(np.zeros(robot.n), keep), feedback.qd, reference, bounds, robot.dt).tau
         sink.put_many(CAN_TX, link.write(Command(Drive.TORQUE, sent)), time.monotonic_ns())
         if lockstep:
             heard = link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)

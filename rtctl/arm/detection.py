@@ -1,15 +1,14 @@
-"""What a tick's feedback shows, in one compiled pass over everything that the detectors and the supervisor ask of it.
+"""What a tick's feedback shows of all that the fault table and the supervisor ask of it."""
 
-Crossing into compiled code costs as much as such a question: twenty questions, one crossing.
-"""
+from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.encoders import watched
+from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions, monitor_encoders
 from rtctl.kernel import kernel
-from rtctl.types import B1, F64, I64
+from rtctl.types import B1, F64, Feedback
 
-# what is seen, at some joint or of some obstacle
+# what is found, at some joint or of some obstacle
 (
     UNHEARD,  # a drive that never answered
     FAULT,  # a drive's fault code
@@ -18,7 +17,7 @@ from rtctl.types import B1, F64, I64
     OUTSIDE,  # a position beyond its limit by more than the tolerance
     FAST,  # a speed beyond its limit by more than the tolerance
     NOT_FINITE,  # a number that is none
-    STUCK,  # an encoder repeats itself; see `watch`
+    STUCK,  # an encoder repeats itself; see `monitor_encoders`
     DISAGREE,  # positions and speed of a joint disagree
     BEYOND,  # a position beyond its limit at all
     STIRS,  # a joint is not at rest
@@ -27,80 +26,104 @@ from rtctl.types import B1, F64, I64
 ) = (1 << i for i in range(13))
 
 
-@kernel
-def notice(
-    noted: F64,
-    active: bool,
-    q: F64,
-    qd: F64,
-    tau: F64,
-    age: F64,
-    replies: I64,
-    drive: I64,
-    sent: F64,
-    q_previous: F64,
-    age_previous: F64,
-    qdd: F64,
-    A: F64,
-    rho: F64,
-    goal_rho: F64,
-    seen_ago: F64,
-    moving: B1,
-    torque_tolerance: F64,
-    friction: F64,
-    velocity_tolerance: F64,
-    limit_tolerance: float,
-    speed_tolerance: float,
-    rest_speed: float,
-    q_min: F64,
-    q_max: F64,
-    qd_max: F64,
-    elapsed: float,
-    dt: float,
-) -> tuple[F64, float, float, int]:
-    """Return the watch (5, n) on the encoders, the greatest age [s] of a reply and of a moving obstacle, and the flags.
+class Clearances(NamedTuple):
+    """How near the K obstacles are, and how sure that is."""
 
-    noted, q to replies, q_previous to A, friction, velocity_tolerance, elapsed, dt: of `watch.watched`, which looks
-    only while the arm is `active`. tau (n,) [Nm] echoed; drive (n,) status; sent (4, n) [Nm] the last commands. rho,
-    goal_rho (K,) [m] from arm and goal to each obstacle; seen_ago (K,) [s] since each was observed, moving (K,) whether
-    that matters. The tolerances are those of SafetyParams; rest_speed [rad/s]; q_min, q_max (n,) [rad],
-    qd_max (n,) [rad/s]. A NaN is NOT_FINITE and fails every other comparison.
-    """
-    flags, oldest, feed_age = 0, 0.0, 0.0
-    for i in range(q.shape[0]):
-        oldest = age[i] if age[i] > oldest else oldest
+    rho: F64  # (K,) [m] from the arm
+    goal_rho: F64  # (K,) [m] from the goal
+    age: F64  # (K,) [s] since each was observed
+    moving: B1  # (K,) whether that matters
+
+
+class JointBounds(NamedTuple):
+    """Where the joints may be and how fast, each (n,)."""
+
+    q_min: F64  # [rad]
+    q_max: F64  # [rad]
+    qd_max: F64  # [rad/s]
+
+
+class Tolerances(NamedTuple):
+    """How far feedback may be off before it is a fault; those of SafetyParams."""
+
+    torque: F64  # (n,) [Nm] of sent against echoed torque
+    limit: float  # [rad] beyond a joint limit
+    speed: float  # fraction of qd_max
+    rest: float  # [rad/s] a joint slower than this rests
+
+
+class Findings(NamedTuple):
+    """What the feedback of a tick shows."""
+
+    flags: int  # the flags above
+    age: float  # [s] greatest of a reply
+    feed_age: float  # [s] greatest since a moving obstacle was observed
+
+
+@kernel
+def _drive_flags(f: Feedback, sent: F64, tolerance: F64) -> int:
+    """Return the flags that drives raise; sent (4, n) [Nm] the last commands, tolerance (n,) [Nm] of an echo."""
+    flags = 0
+    for i in range(f.drive.shape[0]):
         low, high = sent[0, i], sent[0, i]
         for r in range(1, sent.shape[0]):
             low, high = min(low, sent[r, i]), max(high, sent[r, i])
-        if drive[i] < 0:
+        if f.drive[i] < 0:
             flags |= UNHEARD
-        if drive[i] > 1:
+        if f.drive[i] > 1:
             flags |= FAULT
-        if drive[i] == 0:
+        if f.drive[i] == 0:
             flags |= DISABLED
-        if tau[i] < low - torque_tolerance[i] or tau[i] > high + torque_tolerance[i]:
+        if f.tau[i] < low - tolerance[i] or f.tau[i] > high + tolerance[i]:
             flags |= TORQUE
-        if q[i] < q_min[i] - limit_tolerance or q[i] > q_max[i] + limit_tolerance:
+    return flags
+
+
+@kernel
+def _joint_flags(f: Feedback, bounds: JointBounds, tolerances: Tolerances) -> int:
+    """Return the flags that positions and speeds raise."""
+    flags = 0
+    for i in range(f.q.shape[0]):
+        q, speed, q_min, q_max = f.q[i], abs(f.qd[i]), bounds.q_min[i], bounds.q_max[i]
+        if q < q_min - tolerances.limit or q > q_max + tolerances.limit:
             flags |= OUTSIDE
-        if q[i] < q_min[i] or q[i] > q_max[i]:
+        if q < q_min or q > q_max:
             flags |= BEYOND
-        if abs(qd[i]) > speed_tolerance * qd_max[i]:
+        if speed > tolerances.speed * bounds.qd_max[i]:
             flags |= FAST
-        if abs(qd[i]) > rest_speed:
+        if speed > tolerances.rest:
             flags |= STIRS
-        if not (np.isfinite(q[i]) and np.isfinite(qd[i]) and np.isfinite(tau[i])):
+        if not (np.isfinite(q) and np.isfinite(f.qd[i]) and np.isfinite(f.tau[i])):
             flags |= NOT_FINITE
-    for k in range(rho.shape[0]):
-        if rho[k] < 0.0:
+    return flags
+
+
+@kernel
+def examine_feedback(f: Feedback, sent: F64, near: Clearances, bounds: JointBounds, tolerances: Tolerances) -> Findings:
+    """Return what the feedback shows by itself; sent (4, n) [Nm] the last commands, newest first.
+
+    A NaN is NOT_FINITE and fails every other comparison.
+    """
+    flags, age, feed_age = _drive_flags(f, sent, tolerances.torque) | _joint_flags(f, bounds, tolerances), 0.0, 0.0
+    for i in range(f.age.shape[0]):
+        age = f.age[i] if f.age[i] > age else age
+    for k in range(near.rho.shape[0]):
+        if near.rho[k] < 0.0:
             flags |= CONTACT
-        if goal_rho[k] < 0.0:
+        if near.goal_rho[k] < 0.0:
             flags |= GOAL_INSIDE
-        if moving[k] and seen_ago[k] > feed_age:
-            feed_age = seen_ago[k]
-    watch = np.zeros_like(noted)
-    if active:
-        watch, stuck, disagree = watched(
-            noted, q, qd, age, replies, q_previous, age_previous, qdd, A, friction, velocity_tolerance, elapsed, dt
-        )
-        flags |= STUCK * stuck | DISAGREE * disagree
-    return watch, oldest, feed_age, flags
+        if near.moving[k] and near.age[k] > feed_age:
+            feed_age = near.age[k]
+    return Findings(flags, age, feed_age)
+
+
+@kernel
+def encoder_flags(
+    before: F64, f: Feedback, previous: PreviousPositions, expected: ExpectedMotion, bounds: EncoderBounds, dt: float
+) -> tuple[F64, int]:
+    """Return the monitors (5, n) of the encoders after a tick, and the flags STUCK and DISAGREE.
+
+    before (5, n): the monitors of the last tick; dt [s] servo period.
+    """
+    after, stuck, disagree = monitor_encoders(before, f, previous, expected, bounds, dt)
+    return after, STUCK * stuck | DISAGREE * disagree

@@ -135,13 +135,13 @@ class SafetyParams(NamedTuple):
 class Evidence(NamedTuple):
     """What the pipe tells the detectors beside the link's flags."""
 
-    seen: int  # flags of `notice`
+    flags: int  # of `detection`
     age: float  # [s] oldest reply of a joint
     feed_age: float  # [s] oldest observation of a moving obstacle
     missed: int  # slots
     active: bool  # drives are meant to be enabled
     powered: bool  # torque flows, or is being switched on
-    jumped: bool  # a joint's position was implausible: further than it can have moved
+    implausible: bool  # a joint's position is further than it can have moved
     slew_follows_echo: bool  # the slew follows the echo, not what was sent
     armed_outside: bool  # recovery: being outside the limits is known and allowed
     not_finite: bool
@@ -163,7 +163,7 @@ class Counters(NamedTuple):
 
 
 @kernel
-def jumped(
+def implausible_positions(
     q: F64, age: F64, replies: I64, q_previous: F64, age_previous: F64, qd_max: F64, elapsed: float, dt: float
 ) -> B1:
     """Return which joints (n,) report a position [rad] that they cannot have reached since the last plausible one.
@@ -197,15 +197,15 @@ def _grown(count: int, here: bool) -> int:
 @kernel
 def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Counters:
     """Return the counters after a tick; link: types.Link of it."""
-    seen, active = e.seen, e.active
+    flags, active = e.flags, e.active
     corrupt = 1 if link & _CORRUPT else 0
     return Counters(
         ((c.corrupt_window << 1) | corrupt) & 0x3FF,
         _grown(c.send_failed, link & _SEND_FAILED != 0),
-        _grown(c.disabled, active and seen & _DISABLED != 0),
-        _grown(c.mismatch, active and seen & _TORQUE != 0),
+        _grown(c.disabled, active and flags & _DISABLED != 0),
+        _grown(c.mismatch, active and flags & _TORQUE != 0),
         _grown(c.slew_follows_echo, active and e.slew_follows_echo and link & _DERATED == 0),
-        ((c.jumps << 1) | (1 if e.jumped else 0)) & _JUMPS if active else 0,
+        ((c.jumps << 1) | (1 if e.implausible else 0)) & _JUMPS if active else 0,
         _grown(c.missed, e.missed != 0),
         _grown(c.innovation, active and not e.innovation <= innovation_max),
     )
@@ -214,42 +214,42 @@ def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Count
 @kernel
 def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
     """Return the bits of the faults present at this tick; link: types.Link of it; n: the counters with it counted."""
-    seen, active = e.seen, e.active
+    flags, active = e.flags, e.active
     half = 0.5 * dt  # ages are whole periods; half a one keeps rounding out of the comparison
     bits = 0
     if e.age > p.stale_periods * dt + half:
         bits |= _B.feedback_stale
-    if e.age > p.lost_periods * dt + half or seen & detection.UNHEARD:
+    if e.age > p.lost_periods * dt + half or flags & detection.UNHEARD:
         bits |= _B.feedback_lost
     if _count(n.corrupt_window) >= 3:
         bits |= _B.corrupt_frames
     if n.send_failed >= 2:
         bits |= _B.send_failed
-    if seen & detection.FAULT:
+    if flags & detection.FAULT:
         bits |= _B.drive_fault
     if n.disabled >= 5:
         bits |= _B.drive_disabled
     if n.mismatch >= 5 or n.slew_follows_echo >= 5:
         bits |= _B.torque_mismatch
-    if seen & detection.STUCK:
+    if flags & detection.STUCK:
         bits |= _B.encoder_stuck
-    if seen & detection.DISAGREE:
+    if flags & detection.DISAGREE:
         bits |= _B.velocity_mismatch
     if _count(n.jumps) >= 2:
         bits |= _B.encoder_jump
-    if e.not_finite or seen & detection.NOT_FINITE:
+    if e.not_finite or flags & detection.NOT_FINITE:
         bits |= _B.not_finite
     if e.powered and (n.missed >= 3 or e.missed >= 10):
         bits |= _B.deadline
-    if e.has_goal and seen & detection.GOAL_INSIDE:
+    if e.has_goal and flags & detection.GOAL_INSIDE:
         bits |= _B.goal_in_obstacle
-    if active and seen & detection.CONTACT:
+    if active and flags & detection.CONTACT:
         bits |= _B.contact
     if e.feed_age > p.feed_timeout:
         bits |= _B.feed_stale
-    if active and seen & detection.OUTSIDE and not e.armed_outside:
+    if active and flags & detection.OUTSIDE and not e.armed_outside:
         bits |= _B.outside_limits
-    if active and seen & detection.FAST:
+    if active and flags & detection.FAST:
         bits |= _B.overspeed
     if n.innovation >= 5:
         bits |= _B.innovation

@@ -2,7 +2,7 @@
 
     tau = tau_motion + tau_obstacles + tau_limits + tau_posture + h + g
 
-Sorted for the permitter into what drives towards the goal and what must be kept.
+Sorted for the limiter into what drives towards the goal and what must be kept.
 """
 
 from typing import Any, NamedTuple

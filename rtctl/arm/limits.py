@@ -1,4 +1,4 @@
-"""The permitter: the last thing between the law and the bus. Finite, magnitude, slew; nothing else.
+"""The limiter: the last thing between the law and the bus. Finite, magnitude, slew; nothing else.
 
 It is small on purpose and knows nothing of goals or obstacles. The drive repeats magnitude and slew with its own code.
 """
@@ -7,16 +7,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.model import acceleration
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import largest
-from rtctl.types import F64, Cut
+from rtctl.types import F64, Cut, Feedback
 
 _NON_FINITE, _MAGNITUDE, _SLEW, _SCALED = (int(c) for c in (Cut.NON_FINITE, Cut.MAGNITUDE, Cut.SLEW, Cut.MOTION_SCALED))
 
 
-class Permitted(NamedTuple):
-    """The torque that may go out, and what was cut."""
+class TorqueParts(NamedTuple):
+    """The law's torque, sorted by what may be scaled back."""
+
+    drive: F64  # (n,) [Nm] pursues the goal; scaled back as one, so that the direction of the acceleration stays
+    keep: F64  # (n,) [Nm] gravity, damping, obstacles, joint limits; clamped per joint only when it alone is too large
+
+
+class TorqueBounds(NamedTuple):
+    """What bounds the torque of the joints, each (n,)."""
+
+    tau_max: F64  # [Nm] that may be sent
+    tau_rate: F64  # [Nm/s]
+    tau_lsb: F64  # [Nm] rounding of the torque a drive echoes
+    damping: F64  # [Nms/rad] D of the fallback -D qd when anything is not finite
+
+
+class Limited(NamedTuple):
+    """The torque that may go out, and what was limited."""
 
     tau_wanted: F64  # (n,) [Nm] the law's sum, before magnitude and slew
     tau: F64  # (n,) [Nm]
@@ -39,7 +54,7 @@ def slew_reference(tau_sent: F64, tau_echo: F64, tau_rate: F64, tau_lsb: F64, dt
 
     The echo is `lag` periods old and rounded to tau_lsb [Nm], so what was sent since may differ from it by
     lag * tau_rate * dt + tau_lsb and no more. While the drive follows, this is the torque last sent; when it does not
-    (clamped, just enabled, a frame lost) it is pulled to what the drive really applies.
+    (clamped, just enabled, a frame lost) it is as near to that as what the drive really applies allows.
     """
     out = np.empty_like(tau_sent)
     for i in range(tau_sent.shape[0]):
@@ -58,31 +73,28 @@ def slew_follows_echo(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
 
 
 @kernel
-def _permit(
-    drive: F64, keep: F64, qd: F64, reference: F64, tau_max: F64, tau_rate: F64, D: F64, dt: float
-) -> tuple[F64, F64, int, float]:
-    n = drive.shape[0]
-    cut = 0
-    scale = 1.0
-    wanted = drive + keep
-    if not (_finite(drive) and _finite(keep)):
-        cut |= _NON_FINITE
-        scale = 0.0
-        for i in range(n):
-            wanted[i] = -D[i] * qd[i] if np.isfinite(qd[i]) else 0.0
-    tau = wanted.copy()
-    if cut == 0:
-        for i in range(n):
-            # the largest s in [0, 1] with |keep + s drive| <= tau_max on this joint
-            room = tau_max[i] - keep[i] if drive[i] > 0.0 else -tau_max[i] - keep[i]
-            if abs(keep[i] + scale * drive[i]) > tau_max[i] and drive[i] != 0.0:
-                scale = min(scale, max(0.0, room / drive[i]))
-        if scale < 1.0:
-            cut |= _SCALED
-        tau = keep + scale * drive
+def _limit_magnitude(torque: TorqueParts, tau_max: F64) -> Limited:
+    """Scale the driving torque so that the sum (n,) [Nm], which is finite, stays within tau_max (n,) [Nm]."""
+    drive, keep = torque
+    cut, scale = 0, 1.0
+    for i in range(drive.shape[0]):
+        # the largest s in [0, 1] with |keep + s drive| <= tau_max on this joint
+        margin = tau_max[i] - keep[i] if drive[i] > 0.0 else -tau_max[i] - keep[i]
+        if abs(keep[i] + scale * drive[i]) > tau_max[i] and drive[i] != 0.0:
+            scale = min(scale, max(0.0, margin / drive[i]))
+    if scale < 1.0:
+        cut |= _SCALED
+    return Limited(drive + keep, keep + scale * drive, cut, scale)
+
+
+@kernel
+def _limit_slew(tau: F64, reference: F64, bounds: TorqueBounds, dt: float) -> int:
+    """Bound a torque (n,) [Nm] in place, first each joint's magnitude, then the step from the reference."""
+    tau_max, tau_rate = bounds.tau_max, bounds.tau_rate
+    n, cut = tau.shape[0], 0
     for i in range(n):
         if abs(tau[i]) > tau_max[i]:
-            # rounding of the scaled sum may pass the bound by an ulp: that is not a cut worth reporting
+            # rounding of the scaled sum may pass the bound by an ulp: that is not worth reporting
             if abs(tau[i]) > tau_max[i] * (1.0 + 1e-9):
                 cut |= _MAGNITUDE
             tau[i] = tau_max[i] if tau[i] > 0.0 else -tau_max[i]
@@ -101,59 +113,36 @@ def _permit(
         start = min(max(reference[i], -tau_max[i]), tau_max[i])
         step = min(max(share * (tau[i] - start), -tau_rate[i] * dt), tau_rate[i] * dt)
         tau[i] = min(max(start + step, -tau_max[i]), tau_max[i])
-    return wanted, tau, cut, scale
+    return cut
 
 
-def permit(
-    drive: F64, keep: F64, qd: F64, reference: F64, tau_max: F64, tau_rate: F64, damping: F64, dt: float
-) -> Permitted:
+@kernel
+def limit_torque(torque: TorqueParts, qd: F64, reference: F64, bounds: TorqueBounds, dt: float) -> Limited:
     """Return the torque that may be sent.
 
-    drive (n,) [Nm]: torque that pursues the goal; scaled back as one, so that the direction of the acceleration stays.
-    keep (n,) [Nm]: gravity, damping, obstacles, joint limits; clamped per joint only when it alone is too large.
-    qd (n,) [rad/s], reference (n,) [Nm] of slew_reference, tau_max (n,) [Nm], tau_rate (n,) [Nm/s],
-    damping (n,) [Nms/rad] of the fallback -D qd when anything is not finite, dt [s].
+    qd (n,) [rad/s] for the fallback, reference (n,) [Nm] of `slew_reference`, dt [s] servo period.
     """
-    return Permitted(*_permit(drive, keep, qd, reference, tau_max, tau_rate, damping, dt))
+    if _finite(torque.drive) and _finite(torque.keep):
+        limited = _limit_magnitude(torque, bounds.tau_max)
+    else:
+        wanted = np.zeros(qd.shape[0])
+        for i in range(qd.shape[0]):
+            if np.isfinite(qd[i]):
+                wanted[i] = -bounds.damping[i] * qd[i]
+        limited = Limited(wanted, wanted.copy(), _NON_FINITE, 0.0)
+    cut = _limit_slew(limited.tau, reference, bounds, dt)
+    return Limited(limited.tau_wanted, limited.tau, limited.cut | cut, limited.scale)
 
 
 @kernel
 def command_torque(
-    drive: F64,
-    keep: F64,
-    qd: F64,
-    sent: F64,
-    echo: F64,
-    age: F64,
-    tau_max: F64,
-    tau_rate: F64,
-    tau_lsb: F64,
-    D: F64,
-    A_inv: F64,
-    h: F64,
-    g: F64,
-    viscous: F64,
-    dt: float,
-    torque: bool,
-    moving: bool,
-) -> tuple[F64, int, float, bool]:
-    """Return what goes out this tick, with all that follows from it, in one compiled call.
+    torque: TorqueParts, qd: F64, sent: F64, f: Feedback, bounds: TorqueBounds, dt: float
+) -> tuple[Limited, bool]:
+    """Return what may go out this tick, and whether the slew starts from the echo because the drive does not follow.
 
-    drive, keep, qd, tau_max, tau_rate, D: of `permit`. sent: (4, n) [Nm] the last commands, newest first. echo (n,)
-    [Nm], age (n,) [s]: what the drives say they apply, and since when. A_inv, h, g, viscous: of `acceleration`.
-    torque: whether the drives are asked for torque at all. moving: whether the arm is free to move by it.
-    Rows (6, n): tau_wanted, the commands with this one before them, and the acceleration to expect; then Cut bits, the
-    scale of `Permitted`, and whether the slew starts from the echo because the drive does not follow.
+    qd (n,) [rad/s]; sent (4, n) [Nm] the last commands, newest first; f: what the drives say they apply, and since
+    when; dt [s] servo period.
     """
-    n = drive.shape[0]
-    lag = max(1, round(largest(age) / dt))
-    reference = slew_reference(sent[0], echo, tau_rate, tau_lsb, dt, lag)
-    rows = np.zeros((6, n))
-    wanted, tau, cut, scale = _permit(drive, keep, qd, reference, tau_max, tau_rate, D, dt)
-    rows[0] = wanted
-    if torque:
-        rows[1] = tau
-    rows[2:5] = sent[:3]
-    if moving:
-        rows[5] = acceleration(A_inv, rows[1], h, g, viscous, qd)
-    return rows, cut, scale, slew_follows_echo(reference, sent[0], tau_lsb)
+    lag = max(1, round(largest(f.age) / dt))
+    reference = slew_reference(sent[0], f.tau, bounds.tau_rate, bounds.tau_lsb, dt, lag)
+    return limit_torque(torque, qd, reference, bounds, dt), slew_follows_echo(reference, sent[0], bounds.tau_lsb)

@@ -60,7 +60,7 @@ HOT = np.dtype(
             ("qdd", _REAL, _JOINT),  # [rad/s2] predicted from the torque of the last command
             ("q_previous", _REAL, _JOINT),  # [rad] of the last feedback
             ("age_previous", _REAL, _JOINT),  # [s] how old it was
-            ("watch", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.watched`
+            ("watch", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.monitor_encoders`
             ("rest", _INT),  # ticks all joints have been at rest
             # task
             ("has_goal", _INT),

@@ -11,9 +11,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtctl.arm.detection import BEYOND, STIRS, notice
-from rtctl.arm.estimator import EstimatorParams, correct_by_pose, correct_by_twist, filter_joints, predict_tip
-from rtctl.arm.faults import AUTOMATIC, FAULTS, Bounds, Counters, Evidence, counted, detect, jumped
+from rtctl.arm.detection import BEYOND, STIRS, Clearances, JointBounds, Tolerances, encoder_flags, examine_feedback
+from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions
+from rtctl.arm.estimator import (
+    EstimatorParams,
+    JointEstimate,
+    JointParams,
+    TipEstimate,
+    joint_step,
+    predict_by_model,
+    update_pose,
+    update_velocity,
+)
+from rtctl.arm.faults import AUTOMATIC, FAULTS, Bounds, Counters, Evidence, counted, detect, implausible_positions
 from rtctl.arm.model import Model
 from rtctl.arm.target import target_of
 from rtctl.control.faults import latch_with
@@ -59,9 +69,9 @@ def plausible_feedback(c: Any, m: Any, f: Feedback) -> tuple[Feedback, bool]:
     q, age, replies, implausible = f.q.copy(), f.age.copy(), f.replies.copy(), False
     if drives_torque(m) and m.state != _ARMED:
         elapsed, before = c.dt * (1 + f.missed), m.age_previous[:n]
-        odd = jumped(f.q, f.age, f.replies, m.q_previous[:n], before, c.qd_max[:n], elapsed, c.dt)
+        found = implausible_positions(f.q, f.age, f.replies, m.q_previous[:n], before, c.qd_max[:n], elapsed, c.dt)
         for i in range(n):
-            if odd[i]:
+            if found[i]:
                 implausible = True
                 q[i], age[i], replies[i] = m.q_previous[i], min(before[i] + elapsed, c.safety_lost_periods * c.dt), 0
     return (
@@ -83,41 +93,37 @@ def _estimator(c: Any) -> EstimatorParams:
 
 
 @kernel
+def _joint_filter(c: Any, n: int) -> JointParams:
+    return JointParams(
+        c.joint_sigma_qdd[:n].copy(), c.joint_r_q[:n].copy(), c.joint_r_qd[:n].copy(), c.joint_has_qd != 0.0
+    )
+
+
+@kernel
+def _joints(m: Any, n: int) -> JointEstimate:
+    return JointEstimate(m.q[:n].copy(), m.qd[:n].copy(), m.P[:n].copy())
+
+
+@kernel
+def _tip(m: Any) -> TipEstimate:
+    return TipEstimate(m.x.copy(), m.xd.copy(), m.P_tip.copy(), m.R.copy(), m.omega.copy(), m.P_rot.copy())
+
+
+@kernel
+def _put_tip(m: Any, tip: TipEstimate) -> None:
+    m.x[:], m.xd[:], m.P_tip[:], m.R[:], m.omega[:], m.P_rot[:] = tip.x, tip.xd, tip.P, tip.R, tip.omega, tip.P_rot
+
+
+@kernel
 def predict(c: Any, m: Any, f: Feedback, model: Model, elapsed: float) -> bool:
     """Advance joints and tip to this slot; return whether the model must be evaluated, or its task space."""
     n = f.q.shape[0]
     qdd = m.qdd[:n].copy()
-    q, qd, P, surprise = filter_joints(
-        m.q[:n].copy(),
-        m.qd[:n].copy(),
-        m.P[:n].copy(),
-        qdd,
-        f.q,
-        f.qd,
-        f.age,
-        f.replies,
-        elapsed,
-        c.joint_sigma_qdd[:n].copy(),
-        c.joint_r_q[:n].copy(),
-        c.joint_r_qd[:n].copy(),
-        c.joint_has_qd != 0.0,
-    )
-    m.q[:n], m.qd[:n], m.P[:n] = q, qd, P
+    joints, surprise = joint_step(_joints(m, n), qdd, f.q, f.qd, f.age, f.replies, elapsed, _joint_filter(c, n))
+    m.q[:n], m.qd[:n], m.P[:n] = joints.q, joints.qd, joints.P
     m.innovation = largest(surprise)
     if c.carry != 0.0:
-        m.x[:], m.xd[:], m.P_tip[:], m.R[:], m.omega[:], m.P_rot[:] = predict_tip(
-            m.x.copy(),
-            m.xd.copy(),
-            m.P_tip.copy(),
-            m.R.copy(),
-            m.omega.copy(),
-            m.P_rot.copy(),
-            model.J,
-            model.Jdqd,
-            qdd,
-            elapsed,
-            _estimator(c),
-        )
+        _put_tip(m, predict_by_model(_tip(m), model.J, model.Jdqd, qdd, elapsed, _estimator(c)))
     phase = m.phase + c.dt / c.model_dt
     m.evaluated = 1 if phase > 0.0 else 0
     m.phase = phase - 1.0 if phase > 0.0 else phase
@@ -143,15 +149,27 @@ def correct(c: Any, m: Any, model: Model) -> None:
             m.x[:], m.xd[:], m.R[:], m.omega[:] = model.x, twist[:3], model.R, twist[3:]
         return
     p = _estimator(c)
-    x, xd, P, R, omega, P_rot, innovation = correct_by_twist(
-        m.x.copy(), m.xd.copy(), m.P_tip.copy(), m.R.copy(), m.omega.copy(), m.P_rot.copy(), twist, p
-    )
+    tip, innovation = update_velocity(_tip(m), twist[:3], twist[3:], p)
     innovation = greater(innovation, m.innovation)
     if m.evaluated != 0:  # evaluated at the state of this slot: its age is zero
-        x, xd, P, R, omega, P_rot, other = correct_by_pose(x, xd, P, R, omega, P_rot, model.x, model.R, p)
+        tip, other = update_pose(tip, model.x, model.R, 0.0, p)
         innovation = greater(innovation, other)
-    m.x[:], m.xd[:], m.P_tip[:], m.R[:], m.omega[:], m.P_rot[:] = x, xd, P, R, omega, P_rot
+    _put_tip(m, tip)
     m.innovation = innovation
+
+
+@kernel
+def _monitored(c: Any, m: Any, f: Feedback, A: F64) -> tuple[F64, int]:
+    """Return the monitors of the encoders after this tick, and their flags."""
+    n = f.q.shape[0]
+    return encoder_flags(
+        m.watch[:, :n].copy(),
+        f,
+        PreviousPositions(m.q_previous[:n].copy(), m.age_previous[:n].copy(), c.dt * (1 + f.missed)),
+        ExpectedMotion(m.qdd[:n].copy(), A),
+        EncoderBounds(c.safety_friction[:n].copy(), c.safety_velocity_tolerance[:n].copy()),
+        c.dt,
+    )
 
 
 @kernel
@@ -160,48 +178,30 @@ def detect_faults(c: Any, m: Any, f: Feedback, A: F64, around: Surroundings, imp
     n = f.q.shape[0]
     powered = drives_torque(m)
     active = powered and m.state != _ARMED
-    watch, age, feed_age, seen = notice(
-        m.watch[:, :n].copy(),
-        active,
-        f.q,
-        f.qd,
-        f.tau,
-        f.age,
-        f.replies,
-        f.drive,
+    found = examine_feedback(
+        f,
         m.sent[:, :n].copy(),
-        m.q_previous[:n].copy(),
-        m.age_previous[:n].copy(),
-        m.qdd[:n].copy(),
-        A,
-        around.rho,
-        around.goal_rho,
-        around.age,
-        around.moving,
-        c.safety_torque_tolerance[:n].copy(),
-        c.safety_friction[:n].copy(),
-        c.safety_velocity_tolerance[:n].copy(),
-        c.safety_limit_tolerance,
-        c.safety_speed_tolerance,
-        REST_SPEED,
-        c.q_min[:n].copy(),
-        c.q_max[:n].copy(),
-        c.qd_max[:n].copy(),
-        c.dt * (1 + f.missed),
-        c.dt,
+        Clearances(around.rho, around.goal_rho, around.age, around.moving),
+        JointBounds(c.q_min[:n].copy(), c.q_max[:n].copy(), c.qd_max[:n].copy()),
+        Tolerances(
+            c.safety_torque_tolerance[:n].copy(), c.safety_limit_tolerance, c.safety_speed_tolerance, REST_SPEED
+        ),
     )
-    lost = m.cut & _NON_FINITE != 0 or not math.isfinite(m.innovation)
+    monitors, flags = np.zeros((5, n)), found.flags
+    if active:
+        monitors, more = _monitored(c, m, f, A)
+        flags |= more
     evidence = Evidence(
-        seen,
-        age,
-        feed_age,
+        flags,
+        found.age,
+        found.feed_age,
         f.missed,
         active,
         powered,
         implausible,
         m.slew_follows_echo != 0,
         m.recovering != 0,
-        lost,
+        m.cut & _NON_FINITE != 0 or not math.isfinite(m.innovation),
         m.has_goal != 0,
         m.innovation,
     )
@@ -214,7 +214,7 @@ def detect_faults(c: Any, m: Any, f: Feedback, A: F64, around: Surroundings, imp
     for i in range(8):
         k[i] = counters[i]
     m.in_force, m.good[:_FAULTS] = latch_with(m.present, m.in_force, m.good[:_FAULTS].copy(), AUTOMATIC)
-    m.q_previous[:n], m.age_previous[:n], m.watch[:, :n] = f.q, f.age, watch
-    m.outside = 1 if seen & BEYOND else 0
+    m.q_previous[:n], m.age_previous[:n], m.watch[:, :n] = f.q, f.age, monitors
+    m.outside = 1 if flags & BEYOND else 0
     m.recovering = m.recovering & m.outside
-    m.rest = 0 if seen & STIRS else m.rest + 1
+    m.rest = 0 if flags & STIRS else m.rest + 1

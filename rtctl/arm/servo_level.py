@@ -14,9 +14,9 @@ from rtctl.arm.escape import Phase
 from rtctl.arm.faults import STOPS
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
-from rtctl.arm.limits import command_torque
+from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
 from rtctl.arm.memory import HOT
-from rtctl.arm.model import Model
+from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
@@ -150,34 +150,16 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
     if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp -D qd + g, then torque off
         drive, keep = np.zeros(n), _damped_stop(c, m, f, model.g)
-    command = _torque_asked(c, m, f)
-    on = command == _TORQUE
-    rows, cut, _, follows = command_torque(
-        drive,
-        keep,
-        m.qd[:n].copy(),
-        m.sent[:, :n].copy(),
-        f.tau,
-        f.age,
-        c.tau_max[:n].copy(),
-        c.tau_rate[:n].copy(),
-        c.tau_lsb[:n].copy(),
-        c.stop_damping[:n].copy(),
-        model.A_inv,
-        model.h,
-        model.g,
-        c.viscous[:n].copy(),
-        c.dt,
-        on,
-        on and m.state != _ARMED,  # in ARMED brakes may still hold the arm
-    )
-    m.sent[:, :n], m.qdd[:n], m.cut, m.slew_follows_echo = (
-        rows[1:5],
-        rows[5],
-        cut | m.cut,
-        1 if follows else 0,
-    )
-    return command, rows[0].copy()
+    command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
+    bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
+    limited, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
+    tau = limited.tau if command == _TORQUE else np.zeros(n)
+    m.sent[1:, :n], m.sent[0, :n] = m.sent[:3, :n].copy(), tau
+    m.qdd[:n] = 0.0
+    if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
+        m.qdd[:n] = acceleration(model.A_inv, tau, model.h, model.g, c.viscous[:n].copy(), qd)
+    m.cut, m.slew_follows_echo = limited.cut | m.cut, 1 if follows else 0
+    return command, limited.tau_wanted
 
 
 @kernel
