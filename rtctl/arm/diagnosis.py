@@ -38,6 +38,31 @@ class Balance(NamedTuple):
     edge: bool  # the tip is as far in the goal's direction as the links are long
 
 
+class Drive(NamedTuple):
+    """What drives the tip to its goal: tau_m = J^T Lambda F."""
+
+    F: F64  # (6,) [m/s2, rad/s2] that the goal asks for
+    J: F64  # (6, n)
+    A_inv: F64  # (n, n)
+    Lambda: F64  # (6, 6)
+
+
+class Opposed(NamedTuple):
+    """The torques that oppose it, each (n,) [Nm]."""
+
+    own: F64  # of links near each other, as the field alone gives it
+    obstacles: F64  # of them and of obstacles, as it was sent
+    limits: F64  # of joint limits
+
+
+class LimitGaps(NamedTuple):
+    """How far the joints are from their limits, each (n,) [rad or m]."""
+
+    above: F64
+    below: F64
+    zone: F64  # of the limit's potential
+
+
 class Blockers(NamedTuple):
     """What holds the arm."""
 
@@ -79,20 +104,12 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
     )
     obstacles, limits, own, granted = _shares(
-        _drive(robot, m),
-        m.model.J,
-        m.model.A_inv,
-        m.space.Lambda,
+        Drive(_drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda),
+        Opposed(tau_own, m.tau_obstacles, tau_limits),
+        robot.scratch,
         m.model.Jp,
         robot.points.link,
-        robot.scratch,
-        tau_own,
-        m.tau_obstacles,
-        tau_limits,
-        m.joints.q,
-        robot.q_min,
-        robot.q_max,
-        robot.limit.rho0,
+        LimitGaps(robot.q_max - m.joints.q, m.joints.q - robot.q_min, robot.limit.rho0),
     )
     return Balance(
         obstacles,
@@ -115,23 +132,12 @@ def _drive(robot: Robot, m: Memory) -> F64:
 
 @kernel
 def _shares(
-    F: F64,
-    J: F64,
-    A_inv: F64,
-    Lambda: F64,
-    Jp: F64,
-    link: I64,
-    field: Field,
-    tau_own: F64,
-    tau_obstacles: F64,
-    tau_limits: F64,
-    q: F64,
-    q_min: F64,
-    q_max: F64,
-    zone: F64,
+    drive: Drive, opposed: Opposed, field: Field, Jp: F64, link: I64, gaps: LimitGaps
 ) -> tuple[F64, F64, float, float]:
-    """Return the fields of `Balance` from `obstacles` to `granted`."""
-    n, slots = q.shape[0], field.leader.shape[0]
+    """Return the fields of `Balance` from `obstacles` to `granted`; Jp (m, 3, n) and link (m,) of the points."""
+    F, J, A_inv, Lambda = drive
+    tau_own, tau_obstacles, tau_limits = opposed
+    n, slots = tau_own.shape[0], field.leader.shape[0]
     tau_m = tmatvec(J, matvec(Lambda, F))
     qdd = matvec(A_inv, tau_m)
     has = matvec(J, qdd)
@@ -157,8 +163,8 @@ def _shares(
                         obstacles[k] -= f * field.pairs[k, 1 + c, j] * Jp[j, c, i] * qdd[i] / total
     for i in range(n):
         own -= scale * tau_own[i] * qdd[i] / total
-        room = q_max[i] - q[i] if qdd[i] > 0.0 else q[i] - q_min[i]
-        if room < zone[i] and tau_limits[i] * qdd[i] < 0.0:
+        gap = gaps.above[i] if qdd[i] > 0.0 else gaps.below[i]
+        if gap < gaps.zone[i] and tau_limits[i] * qdd[i] < 0.0:
             limits[i] = -tau_limits[i] * qdd[i] / total
     return obstacles, limits, own, given / wanted
 

@@ -71,12 +71,8 @@ def decode(cycle: Cycle, frames: Frames, receivers: e2e.Receivers, age: float) -
     n, size = cycle.block.shape
     if frames.size != size or len(frames.data) != n * size:
         return None
-    state, codes = np.empty((4, n)), np.zeros((6, n), np.int64)
-    raw = np.frombuffer(frames.data, np.uint8)
-    last, disorder = receivers.last, receivers.disorder
-    report = _decode(
-        raw, size, cycle.protected, cycle.scale, cycle.can_id, cycle.words, last, disorder, age, state, codes
-    )
+    raw, last, disorder = np.frombuffer(frames.data, np.uint8), receivers.last, receivers.disorder
+    state, codes, report = _decode(raw, cycle.protected, cycle.scale, cycle.can_id, cycle.words, last, disorder, age)
     return None if report < 0 else Replies(state, codes, report)
 
 
@@ -98,20 +94,12 @@ def _crc(raw: U8, at: int, can_id: int) -> int:
 
 @kernel
 def _decode(
-    raw: U8,
-    size: int,
-    protected: bool,
-    scale: F64,
-    can_id: I64,
-    words: U8,
-    last: I64,
-    disorder: I64,
-    age: float,
-    state: F64,
-    codes: I64,
-) -> int:
-    """Fill state and codes and count on in `last`; return the reports' bits, -1 (and leave `last`) if not whole."""
+    raw: U8, protected: bool, scale: F64, can_id: I64, words: U8, last: I64, disorder: I64, age: float
+) -> tuple[F64, I64, int]:
+    """Return the fields of `Replies` and count on in `last`; report -1, and `last` as it was, unless all is whole."""
     n, report = len(can_id), 0
+    size = len(raw) // n
+    state, codes = np.empty((4, n)), np.zeros((6, n), np.int64)
     for i in range(n):
         head, at = i * size, i * size + _DATA
         j = 0
@@ -123,17 +111,17 @@ def _decode(
         ):
             j += 1
         if j == n or codes[5, j] != 0 or raw[head + _AT_LENGTH] != (e2e.LENGTH if protected else mit.LENGTH):
-            return -1
+            return state, codes, -1
         codes[5, j] = 1
         if raw[at] & 0xF != can_id[j] & 0xF:
-            return -1
+            return state, codes, -1
         if protected:
             sent = np.int64(raw[at + e2e.COVERED]) << 8 | np.int64(raw[at + e2e.COVERED + 1])
             counter = np.int64(raw[at + 8])
             if _crc(raw, at, can_id[j] + mit.REPLY_OFFSET) != sent or disorder[j] != 0:
-                return -1
+                return state, codes, -1
             if counter != (last[j] + 1) & 0xFF:
-                return -1
+                return state, codes, -1
             codes[3, j], codes[4, j] = counter, raw[at + 9]
             report |= codes[4, j]
         b1, b2, b3 = np.int64(raw[at + 1]), np.int64(raw[at + 2]), np.int64(raw[at + 3])
@@ -147,7 +135,7 @@ def _decode(
     if protected:
         for j in range(n):
             last[j] = codes[3, j]
-    return report
+    return state, codes, report
 
 
 @kernel

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.control.firas import firas
+from rtctl.control.firas import FieldParams, firas
 from rtctl.kernel import kernel
 from rtctl.rover.occupancy import CELL, Chart, seen_ahead
 from rtctl.rover.robot import Base
@@ -34,6 +34,13 @@ class Push(NamedTuple):
     rho: F64  # (K,) [m] to each told obstacle, infinite where there is none
     closing: F64  # (K,) [m/s] of each told obstacle towards the base by its own motion
     normal: F64  # (K, 2)
+
+
+class Footprint(NamedTuple):
+    """The points that stand for the base's outline."""
+
+    points: F64  # (m, 2) [m] in the world
+    radius: F64  # (m,) [m]
 
 
 class Twist(NamedTuple):
@@ -79,43 +86,20 @@ def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, now: int, obstacles
     to be pushed by, too coarse to say how near something is.
     """
     c, s = math.cos(yaw), math.sin(yaw)
-    points = x + base.points @ np.array([[c, s], [-s, c]])
-    f = base.field
-    push, rho_seen = _seen(points, base.point_radius, v, seen, now, f.rho0, f.rho_min, f.rho_num, f.eta, f.k_d)
-    told = _told(
-        points,
-        base.point_radius,
-        v,
-        obstacles,
-        base.margins.height,
-        f.rho0,
-        f.rho_min,
-        f.rho_num,
-        f.eta,
-        f.k_d,
-        f.look_ahead,
-    )
-    return Push(push, told[0], rho_seen, told[1], told[2], told[3])
+    footprint = Footprint(x + base.points @ np.array([[c, s], [-s, c]]), base.point_radius)
+    sensed, rho_sensed = _sensed(footprint, v, seen, now, base.field)
+    known, rho, closing, normal = _known(footprint, v, obstacles, base.margins.height, base.field)
+    return Push(sensed, known, rho_sensed, rho, closing, normal)
 
 
 @kernel
-def _seen(
-    points: F64,
-    radius: F64,
-    v: F64,
-    seen: F64,
-    now: int,
-    rho0: float,
-    rho_min: float,
-    rho_num: float,
-    eta: float,
-    k_d: float,
-) -> tuple[F64, float]:
+def _sensed(footprint: Footprint, v: F64, seen: F64, now: int, p: FieldParams) -> tuple[F64, float]:
     """Return (push (2,), rho) of a union of returns.
 
     A surface comes as many returns: their sum would grow with the sensor's resolution. The union's magnitude is that
     of the nearest, its direction the mean of all, weighed by what each would push.
     """
+    points, radius = footprint
     bx, by, weight, strongest, nearest = 0.0, 0.0, 0.0, 0.0, math.inf
     for i in range(seen.shape[0]):
         rho, nx, ny = math.inf, 1.0, 0.0
@@ -128,9 +112,9 @@ def _seen(
                     nx, ny = dx / d, dy / d
         if i < now:
             nearest = min(nearest, rho)
-        if rho >= rho0:
+        if rho >= p.rho0:
             continue
-        a, d = firas(rho, nx * v[0] + ny * v[1], rho0, rho_min, rho_num, eta, k_d)
+        a, d = firas(rho, nx * v[0] + ny * v[1], p.rho0, p.rho_min, p.rho_num, p.eta, p.k_d)
         bx, by, weight = bx + (a + d) * nx, by + (a + d) * ny, weight + a + d
         strongest = max(strongest, a + d)
     out = np.zeros(2)
@@ -140,20 +124,11 @@ def _seen(
 
 
 @kernel
-def _told(
-    points: F64,
-    radius: F64,
-    v: F64,
-    obstacles: Obstacles,
-    height: float,
-    rho0: float,
-    rho_min: float,
-    rho_num: float,
-    eta: float,
-    k_d: float,
-    look_ahead: float,
+def _known(
+    footprint: Footprint, v: F64, obstacles: Obstacles, height: float, p: FieldParams
 ) -> tuple[F64, F64, F64, F64]:
     """Return (push (K, 2), rho (K,), closing (K,), normal (K, 2)); the nearest point of the footprint is pushed."""
+    points, radius = footprint
     slots, m = obstacles.active.shape[0], points.shape[0]
     P, out = np.empty((3, m)), np.zeros((slots, 4, m))
     for j in range(m):
@@ -172,9 +147,9 @@ def _told(
         nx, ny = (nx / flat, ny / flat) if flat > 1e-6 else (1.0, 0.0)
         towards = nx * obstacles.v[k, 0] + ny * obstacles.v[k, 1]
         rhos[k], closing[k], normal[k, 0], normal[k, 1] = rho, max(towards, 0.0), nx, ny
-        wide = rho0 + max(towards, 0.0) * look_ahead
+        wide = p.rho0 + max(towards, 0.0) * p.look_ahead
         if rho < wide:
-            a, d = firas(rho, nx * v[0] + ny * v[1] - towards, wide, rho_min, rho_num, eta, k_d)
+            a, d = firas(rho, nx * v[0] + ny * v[1] - towards, wide, p.rho_min, p.rho_num, p.eta, p.k_d)
             push[k, 0], push[k, 1] = (a + d) * nx, (a + d) * ny
     return push, rhos, closing, normal
 

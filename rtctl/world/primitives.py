@@ -302,9 +302,9 @@ def _dear(P: F64, radius: F64, obstacles: Obstacles, k: int, cutoff: float, out:
     """Distances to the kinds that ask their bounding box first."""
     R, p, dims = obstacles.R, obstacles.p, obstacles.dims
     if obstacles.kind[k] == MESH:
-        tree.many(P, radius, R, p, k, obstacles.mesh, int(dims[k, 3]), 0.0, cutoff, out)
+        tree.many(P, radius, R, p, k, tree.Body(obstacles.mesh, int(dims[k, 3]), 0.0), cutoff, out)
     elif obstacles.kind[k] == CLOUD:
-        tree.many(P, radius, R, p, k, obstacles.clouds[int(dims[k, 3])], 0, dims[k, 0], cutoff, out)
+        tree.many(P, radius, R, p, k, tree.Body(obstacles.clouds[int(dims[k, 3])], 0, dims[k, 0]), cutoff, out)
     else:
         _superquadric(P, radius, R, p, dims, k, cutoff, out)
 

@@ -11,12 +11,21 @@ inside. The shortcuts, radial distance and f/|grad f|, are wrong by factors of 4
 """
 
 import math
+from typing import NamedTuple
 
 from rtctl.kernel import kernel
 
 _FLAT = 1e-10  # |sum X^p - 1| below which the first-order distance is exact to 1e-20 of the size
 _NONE = 2.0  # "this coordinate would leave the box": any value above 1 reads as outside the surface
 _SAMPLES = 12  # per axis, inside: brackets of stationary points; tests hold the result to dense sampling
+
+
+class Axes(NamedTuple):
+    """A number for each axis: of the frame's, or these turned round so that the one that is searched along is first."""
+
+    a: float
+    b: float
+    c: float
 
 
 @kernel
@@ -221,33 +230,29 @@ def _rising(X: float, k: float, p: float) -> float:
 
 
 @kernel
-def _excess(
-    t: float, X: float, Y: float, Z: float, ca: float, cb: float, cc: float, pa: float, pb: float, pc: float
-) -> tuple[float, float, float]:
-    """Return (sum t_i^p_i - 1, t_b, t_c) along the stationary curve on which axis a has coordinate t >= X."""
-    m = (t - X) / (ca * _power(t, pa - 1.0))
-    u, v = _rising(Y, m * cb, pb), _rising(Z, m * cc, pc)
+def _excess(t: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float, float]:
+    """Return (sum t_i^p_i - 1, t_b, t_c) along the stationary curve on which axis a has coordinate t >= X; k: p/a^2."""
+    m = (t - X.a) / (k.a * _power(t, p.a - 1.0))
+    u, v = _rising(X.b, m * k.b, p.b), _rising(X.c, m * k.c, p.c)
     if u > 1.0 or v > 1.0:
         return _NONE, u, v
-    return _power(t, pa) + _power(u, pb) + _power(v, pc) - 1.0, u, v
+    return _power(t, p.a) + _power(u, p.b) + _power(v, p.c) - 1.0, u, v
 
 
 @kernel
-def _root(
-    lo: float, hi: float, X: float, Y: float, Z: float, ca: float, cb: float, cc: float, pa: float, pb: float, pc: float
-) -> tuple[float, float, float]:
+def _root(lo: float, hi: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float, float]:
     """Return (t_a, t_b, t_c) where `_excess` turns from <= 0 at lo to >= 0 at hi: of the steps, the nearest to zero.
 
     Regula falsi (Illinois) where both ends have a value, bisection where the upper one has none and every third step.
     """
-    low, u, v = _excess(lo, X, Y, Z, ca, cb, cc, pa, pb, pc)
-    high = _excess(hi, X, Y, Z, ca, cb, cc, pa, pb, pc)[0]
+    low, u, v = _excess(lo, X, k, p)
+    high = _excess(hi, X, k, p)[0]
     t, least = lo, abs(low)
     for i in range(80):
         mid = 0.5 * (lo + hi)
         if high < 1.0 and i % 3 != 2:
             mid = lo + (hi - lo) * low / (low - high) if low < 0.0 else lo
-        excess, u_mid, v_mid = _excess(mid, X, Y, Z, ca, cb, cc, pa, pb, pc)
+        excess, u_mid, v_mid = _excess(mid, X, k, p)
         if abs(excess) < least:
             least, t, u, v = abs(excess), mid, u_mid, v_mid
         if excess > 0.0:
@@ -260,10 +265,9 @@ def _root(
 
 
 @kernel
-def _scaled(
-    t: float, u: float, v: float, X: float, Y: float, Z: float, a: float, b: float, c: float, p: float, pz: float
-) -> tuple[float, float, float, float]:
+def _scaled(foot: Axes, X: Axes, size: Axes, p: float, pz: float) -> tuple[float, float, float, float]:
     """Return (distance to it, t, u, v) of a candidate pushed radially onto the surface: always an upper bound."""
+    t, u, v = foot
     k = 0.0
     for _ in range(40):  # Newton on log sum over log scale: convex and rising
         flat, steep = _power(t, p) + _power(u, p), _power(v, pz)
@@ -272,37 +276,41 @@ def _scaled(
         t, u, v = t * k, u * k, v * k
         if abs(step) < 1e-15:
             break
-    e, f, g = a * (t - X), b * (u - Y), c * (v - Z)
+    e, f, g = size.a * (t - X.a), size.b * (u - X.b), size.c * (v - X.c)
     return math.sqrt(e * e + f * f + g * g), t, u, v
 
 
 @kernel
-def _along(
-    X: float, Y: float, Z: float, a: float, b: float, c: float, pa: float, pb: float, pc: float, order: int, most: float
-) -> tuple[float, float, float, float]:
+def _back(v: Axes, order: int) -> Axes:
+    """Return in x, y, z order what was turned round by `order` places."""
+    if order == 0:
+        return v
+    if order == 1:  # (a, b, c) = (y, z, x)
+        return Axes(v.c, v.a, v.b)
+    return Axes(v.b, v.c, v.a)  # (a, b, c) = (z, x, y)
+
+
+@kernel
+def _along(X: Axes, size: Axes, p: Axes, order: int, most: float) -> tuple[float, float, float, float]:
     """Return the best stationary point on the curve of axis a as (distance, t, u, v) in x, y, z order, if below most.
 
     `order` says how many places (a, b, c) was rotated from (x, y, z). The distance is at least a (t - X), so `most`
     limits the range of t.
     """
-    ca, cb, cc = pa / (a * a), pb / (b * b), pc / (c * c)
+    k = Axes(p.a / (size.a * size.a), p.b / (size.b * size.b), p.c / (size.c * size.c))
+    X_xyz, size_xyz, p_xyz = _back(X, order), _back(size, order), _back(p, order)
     best, bt, bu, bv = most, 0.0, 0.0, 0.0
-    floor = max(X, 0.02)
-    hi = min(1.0, X + most / a * (1.0 + 1e-9))
+    floor = max(X.a, 0.02)
+    hi = min(1.0, X.a + most / size.a * (1.0 + 1e-9))
     span = hi - floor
-    upper = _excess(hi, X, Y, Z, ca, cb, cc, pa, pb, pc)[0]
+    upper = _excess(hi, X, k, p)[0]
     for i in range(1, _SAMPLES + 1):
         lo = floor + span * (_SAMPLES - i) / _SAMPLES
-        lower = _excess(lo, X, Y, Z, ca, cb, cc, pa, pb, pc)[0]
-        if lower <= 0.0 and upper >= 0.0 and a * (lo - X) < best:
-            t, u, v = _root(lo, hi, X, Y, Z, ca, cb, cc, pa, pb, pc)
-            # In x, y, z order again: the exponents of x and y are equal, so z must be at its place.
-            if order == 0:
-                d, t, u, v = _scaled(t, u, v, X, Y, Z, a, b, c, pa, pc)
-            elif order == 1:  # (a, b, c) = (y, z, x)
-                d, t, u, v = _scaled(v, t, u, Z, X, Y, c, a, b, pa, pb)
-            else:  # (a, b, c) = (z, x, y)
-                d, t, u, v = _scaled(u, v, t, Y, Z, X, b, c, a, pb, pa)
+        lower = _excess(lo, X, k, p)[0]
+        if lower <= 0.0 and upper >= 0.0 and size.a * (lo - X.a) < best:
+            t, u, v = _root(lo, hi, X, k, p)
+            # in x, y, z order again: the exponents of x and y are equal, so z must be at its place
+            d, t, u, v = _scaled(_back(Axes(t, u, v), order), X_xyz, size_xyz, p_xyz.a, p_xyz.c)
             if d < best:
                 best, bt, bu, bv = d, t, u, v
         hi, upper = lo, lower
@@ -336,13 +344,13 @@ def _inside(
     d, s = _to_face(Z, X, Y, c, pz, p, p)
     if d < best:
         best, t, u, v = d, X, Y, s
-    d, t1, u1, v1 = _along(X, Y, Z, a, b, c, p, p, pz, 0, best)
+    d, t1, u1, v1 = _along(Axes(X, Y, Z), Axes(a, b, c), Axes(p, p, pz), 0, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
-    d, t1, u1, v1 = _along(Y, Z, X, b, c, a, p, pz, p, 1, best)
+    d, t1, u1, v1 = _along(Axes(Y, Z, X), Axes(b, c, a), Axes(p, pz, p), 1, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
-    d, t1, u1, v1 = _along(Z, X, Y, c, a, b, pz, p, p, 2, best)
+    d, t1, u1, v1 = _along(Axes(Z, X, Y), Axes(c, a, b), Axes(pz, p, p), 2, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
     return -best, p / a * _power(t, p - 1.0), p / b * _power(u, p - 1.0), pz / c * _power(v, pz - 1.0)

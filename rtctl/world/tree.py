@@ -12,6 +12,7 @@ stand. So whoever sends a cloud may sort it, and need not be trusted to have don
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -250,70 +251,78 @@ def _side(body: F64, o: int, item: int, x: float, y: float, z: float) -> tuple[f
     return sign * d, nx, ny, nz
 
 
+class Body(NamedTuple):
+    """A cloud or a mesh."""
+
+    data: F64  # see above
+    at: int  # where it begins there
+    grown: float  # [m] thickness of its items
+
+
+class Search(NamedTuple):
+    """Work memory of a walk through a tree."""
+
+    nodes: I64  # (DEPTH,)
+    keys: F64  # (DEPTH,)
+
+
 @kernel
-def _measure(
-    P: F64,
-    radius: F64,
-    R: F64,
-    p: F64,
-    k: int,
-    j: int,
-    body: F64,
-    o: int,
-    grown: float,
-    limit: float,
-    nodes: I64,
-    keys: F64,
-    out: F64,
-) -> None:
-    """Write distance and normal of point j; where all is farther than `limit` [m], that limit, a lower bound."""
-    dx, dy, dz = P[0, j] - p[k, 0], P[1, j] - p[k, 1], P[2, j] - p[k, 2]
-    x = dx * R[k, 0, 0] + dy * R[k, 1, 0] + dz * R[k, 2, 0]
-    y = dx * R[k, 0, 1] + dy * R[k, 1, 1] + dz * R[k, 2, 1]
-    z = dx * R[k, 0, 2] + dy * R[k, 1, 2] + dz * R[k, 2, 2]
-    most = limit + grown + radius[j]
-    d2, item = _nearest(body, o, x, y, z, most * most, nodes, keys)
-    e, f, g = 0.0, 0.0, 1.0
+def _exact(body: Body, x: float, y: float, z: float, most: float, search: Search) -> tuple[float, float, float, float]:
+    """Return (distance, unit normal) of a point in the body's frame, or `most` [m] and z where all is farther."""
+    data, o = body.data, body.at
+    d2, item = _nearest(data, o, x, y, z, most * most, search.nodes, search.keys)
     if item < 0:
-        d = most
-    elif body[o + 3] == 3.0:
-        d = math.sqrt(d2)
-        if d > 0.0:
-            e, f, g = (x - body[item]) / d, (y - body[item + 1]) / d, (z - body[item + 2]) / d
-            size = math.sqrt(e * e + f * f + g * g)  # of a tiny difference the square has lost digits
-            e, f, g = (e / size, f / size, g / size) if size > 0.0 else (0.0, 0.0, 1.0)
-    else:
-        d, e, f, g = _side(body, o, item, x, y, z)
-    out[k, 0, j] = d - grown - radius[j] + 0.0 * (x + y + z)  # not a number in, not a number out
-    for i in range(3):
-        out[k, 1 + i, j] = R[k, i, 0] * e + R[k, i, 1] * f + R[k, i, 2] * g
+        return most, 0.0, 0.0, 1.0
+    if data[o + 3] != 3.0:
+        return _side(data, o, item, x, y, z)
+    d = math.sqrt(d2)
+    if d > 0.0:
+        e, f, g = (x - data[item]) / d, (y - data[item + 1]) / d, (z - data[item + 2]) / d
+        size = math.sqrt(e * e + f * f + g * g)  # of a tiny difference the square has lost digits
+        if size > 0.0:
+            return d, e / size, f / size, g / size
+    return d, 0.0, 0.0, 1.0
 
 
 @kernel
-def many(P: F64, radius: F64, R: F64, p: F64, k: int, body: F64, o: int, grown: float, cutoff: float, out: F64) -> None:
-    """Distances of points to the cloud or mesh at `body[o:]`, in slot k, whose items are `grown` [m] thick.
+def _local(P: F64, R: F64, p: F64, k: int, j: int) -> tuple[float, float, float]:
+    """Return point j in the frame of slot k."""
+    dx, dy, dz = P[0, j] - p[k, 0], P[1, j] - p[k, 1], P[2, j] - p[k, 2]
+    return (
+        dx * R[k, 0, 0] + dy * R[k, 1, 0] + dz * R[k, 2, 0],
+        dx * R[k, 0, 1] + dy * R[k, 1, 1] + dz * R[k, 2, 1],
+        dx * R[k, 0, 2] + dy * R[k, 1, 2] + dz * R[k, 2, 2],
+    )
 
-    As the kernels of `distance`, behind a pre-filter: the box about all is never farther than what is in it. The point
-    nearest to the box is made exact first; whatever is nearer than the cut-off, or than all points before, is exact,
-    so the least is; an entry left as a lower bound is above both.
-    """
-    if radius.shape[0] == 0:
-        return
-    nodes, keys = np.empty(DEPTH, np.int64), np.empty(DEPTH)
-    root, first, solid = o + HEAD + 6, 0, body[o + 3] == 9.0
+
+@kernel
+def _boxed(P: F64, radius: F64, R: F64, p: F64, k: int, body: Body, out: F64) -> int:
+    """Write the distances to the box about a body, never farther than what is in it; return the nearest point."""
+    root, solid, first = body.at + HEAD + 6, body.data[body.at + 3] == 9.0, 0
     for j in range(radius.shape[0]):
-        dx, dy, dz = P[0, j] - p[k, 0], P[1, j] - p[k, 1], P[2, j] - p[k, 2]
-        x = dx * R[k, 0, 0] + dy * R[k, 1, 0] + dz * R[k, 2, 0]
-        y = dx * R[k, 0, 1] + dy * R[k, 1, 1] + dz * R[k, 2, 1]
-        z = dx * R[k, 0, 2] + dy * R[k, 1, 2] + dz * R[k, 2, 2]
+        x, y, z = _local(P, R, p, k, j)
         # beside a cloud nothing is farther below 0 than the thickness; in the box of a mesh anything may be
-        d2 = _box2(body, root, x, y, z)
-        out[k, 0, j] = -math.inf if solid and d2 == 0.0 else math.sqrt(d2) - grown - radius[j]
+        d2 = _box2(body.data, root, x, y, z)
+        out[k, 0, j] = -math.inf if solid and d2 == 0.0 else math.sqrt(d2) - body.grown - radius[j]
         out[k, 0, j] += 0.0 * (x + y + z)  # not a number in, not a number out
         out[k, 1, j], out[k, 2, j], out[k, 3, j] = R[k, 0, 2], R[k, 1, 2], R[k, 2, 2]
         if out[k, 0, j] < out[k, 0, first]:
             first = j
-    least = math.inf
+    return first
+
+
+@kernel
+def many(P: F64, radius: F64, R: F64, p: F64, k: int, body: Body, cutoff: float, out: F64) -> None:
+    """Distances of points to a cloud or mesh in slot k.
+
+    As the kernels of `distance`, behind a pre-filter: the point nearest to the box about all is made exact first;
+    whatever is nearer than the cut-off, or than all points before, is exact, so the least is; an entry left as a lower
+    bound is above both.
+    """
+    if radius.shape[0] == 0:
+        return
+    first, least = _boxed(P, radius, R, p, k, body, out), math.inf
+    search = Search(np.empty(DEPTH, np.int64), np.empty(DEPTH))
     for i in range(-1, radius.shape[0]):
         j = first if i < 0 else i
         if i == first:
@@ -322,8 +331,12 @@ def many(P: F64, radius: F64, R: F64, p: F64, k: int, body: F64, o: int, grown: 
         limit += _SLACK * (1.0 + abs(limit))
         if out[k, 0, j] > limit:
             continue
-        if out[k, 0, j] == -math.inf or limit + grown + radius[j] <= 0.0:
+        if out[k, 0, j] == -math.inf or limit + body.grown + radius[j] <= 0.0:
             limit = math.inf
-        _measure(P, radius, R, p, k, j, body, o, grown, limit, nodes, keys, out)
+        x, y, z = _local(P, R, p, k, j)
+        d, e, f, g = _exact(body, x, y, z, limit + body.grown + radius[j], search)
+        out[k, 0, j] = d - body.grown - radius[j] + 0.0 * (x + y + z)  # not a number in, not a number out
+        for c in range(3):
+            out[k, 1 + c, j] = R[k, c, 0] * e + R[k, c, 1] * f + R[k, c, 2] * g
         if out[k, 0, j] < least:
             least = out[k, 0, j]
