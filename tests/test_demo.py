@@ -1,6 +1,7 @@
 """The demo: played by two processes over a bus, told by the log and the drives, drawn on one page."""
 
 import re
+import signal
 import struct
 import subprocess
 import sys
@@ -416,3 +417,18 @@ def test_an_outline_is_the_hull_of_the_solid_s_shadow(kind: str, dims: list[floa
     assert outline.volume == pytest.approx(hull.volume, rel=0.01)
     outside = (outline.equations[:, :2] @ shadow.T + outline.equations[:, 2:]).max(0)
     assert outside.max() < 2e-3  # [m], between two of its corners
+
+
+def test_a_demo_that_is_told_to_end_leaves_no_process_behind(tmp_path: Path) -> None:
+    scenario = tmp_path / "scene.toml"
+    scenario.write_text(SCENE.format(duration=60.0))
+    command = [sys.executable, "-m", "tools.demo", "--lockstep", "--scenario", str(scenario), "--out", str(tmp_path)]
+    demo = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert demo.stdout is not None
+    assert any("ready, log" in line for line in demo.stdout)
+    children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
+    assert len(children) >= 2
+    demo.send_signal(signal.SIGTERM)
+    demo.communicate()
+    assert demo.returncode == 130
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]

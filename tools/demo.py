@@ -13,6 +13,7 @@ LOCKSTEP: time goes on when the drives have been answered, and there are no dead
 import argparse
 import os
 import re
+import signal
 import sys
 import tempfile
 import time
@@ -66,6 +67,7 @@ class Voice:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code."""
     args = _arguments(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # nor does this leave drives or controller behind
     voice = Voice()
     try:
         return _demo(args, voice)

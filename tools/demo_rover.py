@@ -9,6 +9,7 @@ autopilot's own avoidance (ArduPilot BendyRuler, skid-steer, 2 m/s) needed in th
 
 import argparse
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -51,6 +52,7 @@ class Run(NamedTuple):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code."""
     args = _arguments(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # nor does this leave rover or controller behind
     console = Console(highlight=False)
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -62,6 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RtctlError as error:
         print(f"demo: {error}", file=sys.stderr)
         return error.exit_code
+    except KeyboardInterrupt:
+        print("demo: interrupted; both processes were ended", file=sys.stderr)
+        return 130
     console.print(_table(runs))
     plot = out / "rover.png"
     draw(runs, plot)
