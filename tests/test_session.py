@@ -211,6 +211,21 @@ def test_beyond_a_limit_arming_is_refused_and_recovering_is_not():
     assert arm.memory.speed_scale == pytest.approx(0.1)
 
 
+def test_where_nothing_is_beyond_a_limit_there_is_nothing_to_recover_from():
+    for q in (PANDA_HOME, at_limit()):
+        arm = idle(q)
+        assert arm.ask(Verb.RECOVER) == f"recover: {session.INSIDE}"
+        arm.ticks(round(SETTLE / DT) + 2)
+        assert (arm.state(), arm.drive(), arm.memory.recovering) == (State.IDLE, Drive.DISABLE, False)
+        assert arm.ask(Verb.ARM) == ""
+
+
+def at_limit() -> np.ndarray:
+    q = PANDA_HOME.copy()
+    q[3] = robot().q_min[3]
+    return q
+
+
 # ---- out
 
 

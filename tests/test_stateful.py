@@ -134,7 +134,8 @@ class Session(RuleBasedStateMachine):
         for verb in (Verb.RESET, Verb.RESET, Verb.RESET):
             self._step(Request(verb, obstacles=(ObstacleEdit("*", None),)))
             self._play(60)
-        self._step(Request(Verb.RECOVER))
+        assert self.lab is not None
+        self._step(Request(Verb.RECOVER if self.lab.memory.outside else Verb.ARM))
         self._play(400)
         self._step(Request(goal=Goal(np.array(goal), np.array([0.0, 1.0, 0.0, 0.0]), Task.POSITION, 0.003, 0.015)))
         self._play(30)

@@ -104,7 +104,7 @@ class ArmFeed:
         self.waiting = None
         verb = Verb.NONE
         if m.state == State.IDLE and m.tick < 0:
-            verb = Verb.RECOVER if _outside(self.robot, truth) else Verb.ARM
+            verb = Verb.RECOVER if _outside(self.robot, m.joints.q) else Verb.ARM
         goal = None
         due = self.pending and truth.time >= self.pending[0].at_s
         if due and m.state == State.RUN and not m.outside:
@@ -160,8 +160,9 @@ def _same_and_still(a: Shape, b: Shape) -> bool:
     return not moving and bool((a.position == b.position).all())
 
 
-def _outside(robot: Robot, truth: Truth) -> bool:
-    return bool(((truth.q < robot.q_min) | (truth.q > robot.q_max)).any())
+def _outside(robot: Robot, q: F64) -> bool:
+    """Return whether a joint is beyond its limits at q (n,) [rad], as the drives tell it: so the tick will judge."""
+    return bool(((q < robot.q_min) | (q > robot.q_max)).any())
 
 
 class ArmPlay:

@@ -18,6 +18,7 @@ from rtctl.world import obstacle_table
 CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
 CLEARING = "drive faults are being cleared now: reset again"
 OUTSIDE = "a joint is beyond its limits: move it back by hand, or use recover"
+INSIDE = "no joint is beyond its limits, there is nothing to recover from: use arm"
 RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {})
 
 
@@ -27,14 +28,19 @@ def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, pr
         return m  # what RUN is left for is asked, or a fault
     verb, before = request.verb, m.state
     clearing = verb == Verb.RESET and supervisor.admits(before, verb) and bool(present & BIT["drive_fault"])
-    outside = verb == Verb.ARM and m.outside
+    if verb == Verb.ARM and m.outside:
+        refusal = OUTSIDE
+    elif verb == Verb.RECOVER and not m.outside:
+        refusal = INSIDE
+    else:
+        refusal = ""
     asked = Asked(
         m.tick,
         verb,
         present,
         _timed(robot, m, reductions.all_equal(feedback.drive, 1)),
         CLEARING if clearing else "",
-        OUTSIDE if outside else "",
+        refusal,
     )
     step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
     m = m._replace(**step.session._asdict(), verdict=step.refusal or m.verdict)

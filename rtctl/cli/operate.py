@@ -15,7 +15,7 @@ VERBS = {
     "disarm": "come to rest, then disable the drives",
     "stop": "brake now; only an operator's reset leaves the stop",
     "reset": "leave a latched stop or fault, once its cause is gone",
-    "recover": "allow a slow move inward from beyond a joint limit",
+    "recover": "where a joint is beyond its limit: enable the drives, move slowly inward",
 }
 KEYS_OF = {
     "sphere": "radius_m",
