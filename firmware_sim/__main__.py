@@ -28,7 +28,9 @@ from firmware_sim.rover_serve import serve
 from firmware_sim.settings import SettingsError
 from firmware_sim.simulator import Simulator, open_simulator
 
-QUIET_S = 1.0  # [s] of silence after which lockstep time goes on by itself: a busy machine is silent for less
+# [s] of silence after which lockstep time goes on by itself: a busy machine is silent for less, and a controller that
+# misses a reply waits for 2 s (rtctl.app.vehicle.LOCKSTEP_WAIT). Were this shorter, one lost reply would trip them all.
+QUIET_S = 3.0
 ASLEEP_S = 0.05  # [s] from one period to the next while nobody speaks and every brake is closed
 SLIP_NS = 10 * 1_000_000  # a real-time clock that is later than this gives the lost time up
 CATCH_UP = 20  # steps in a row before frames are answered: a state of the past would pass for one of now

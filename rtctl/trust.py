@@ -32,6 +32,16 @@ def user_name(uid: int) -> str:
     return str(uid)
 
 
+def user_id(text: str) -> int:
+    """Return the id of a user who is named, or given by number. Raises TrustError where there is none."""
+    if text.isascii() and text.isdecimal() and int(text) < 1 << 32:
+        return int(text)
+    try:
+        return pwd.getpwnam(text).pw_uid
+    except (KeyError, ValueError):
+        raise TrustError(f"{text[:80]!r}: no user of this machine") from None
+
+
 def trusted_users() -> frozenset[int]:
     """Return the user ids whose files and sockets count: this process's own, and root's."""
     return frozenset((0, os.geteuid()))

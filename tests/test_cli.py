@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import pwd
 import re
 import resource
 import signal
@@ -631,3 +632,26 @@ def test_doctor_leaves_the_callers_scheduler_alone_and_its_verdict_is_the_exit_c
     assert os.sched_getscheduler(0) == before
     assert code == (EXIT_OK if found["ok"] else EXIT_FAILED)
     assert {row["name"] for row in found["findings"]} >= {"wake-up latency", "real-time priority", "clock source"}
+
+
+@pytest.mark.parametrize(("name", "code"), [("root", 2), ("0", 2), (str(os.geteuid()), 2), ("no such user", 1)])
+def test_only_a_strangers_lock_can_be_passed_over(name: str, code: int, capsys: Said) -> None:
+    assert main(["run", "none.toml", "--pass-lock-of", name]) == code
+    said = capsys.readouterr().err
+    assert said.startswith("rtctl: ")
+    assert name in said
+
+
+def test_whose_lock_is_passed_over_reaches_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rtctl.app import daemon
+
+    asked: list[Any] = []
+
+    def run(config: str, **how: Any) -> int:
+        asked.append(how["passing"])
+        return EXIT_OK
+
+    monkeypatch.setattr(daemon, "run", run)
+    assert main(["run", "none.toml", "--pass-lock-of", "nobody", "--pass-lock-of", "12345"]) == EXIT_OK
+    assert main(["run", "none.toml"]) == EXIT_OK
+    assert asked == [{pwd.getpwnam("nobody").pw_uid, 12345}, frozenset()]

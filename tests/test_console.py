@@ -26,7 +26,7 @@ from rtctl.errors import ConfigError, LinkError, RequestError
 from rtctl.hal import client, console, messages
 from rtctl.hal.console import Console
 from rtctl.hal.messages import Bounds
-from rtctl.types import Request, Task, Verb
+from rtctl.types import ObstacleEdit, Request, Task, Verb
 
 BOUNDS = Bounds(centre=(0.0, 0.0, 0.3), radius=1.2, tolerance=0.003, tolerance_rot=0.015)
 PERIOD = 0.001
@@ -655,3 +655,22 @@ def test_a_missing_a_dead_and_a_mute_daemon_are_link_errors(tmp_path: Path) -> N
         client.ask(path, {"verb": "stop"})
     with pytest.raises(LinkError):
         client.ask("/" + "x" * 300, {"verb": "stop"})
+
+
+BALL = {"name": "ball", "type": "sphere", "radius_m": 0.1, "position_m": [0.4, 0.0, 0.5]}
+
+
+def test_an_obstacle_that_a_person_puts_where_none_can_be_is_refused_and_a_cameras_is_not(daemon: Daemon) -> None:
+    judged: list[str] = []
+
+    def misplaced(edit: ObstacleEdit) -> str:
+        judged.append(edit.name)
+        return "would lie 0.1 m inside link3" if edit.shape is not None else ""
+
+    daemon.console.publish(dict, dict, misplaced)
+    reply, requests = round_trip(daemon, {"verb": "obstacle", "set": BALL})
+    assert (reply, requests) == ({"ok": False, "error": "obstacle ball: would lie 0.1 m inside link3"}, [])
+    assert round_trip(daemon, {"verb": "obstacle", "clear": "ball"})[0]["ok"]
+    _, requests = round_trip(daemon, {"verb": "obstacles", "set": [BALL]})
+    assert [edit.name for request in requests for edit in request.obstacles] == ["ball"]
+    assert judged == ["ball", "ball"]

@@ -100,6 +100,17 @@ class TestSession:
         assert "RUN" in shown.stdout
         assert "arrived" in shown.stdout
 
+    def test_a_ball_on_the_tip_is_refused_and_the_arm_stays_where_it_is(self, idle: Rig) -> None:
+        idle.arm()
+        before = idle.status()
+        ball = {"name": "ball", "type": "sphere", "radius_m": 0.1, "position_m": before["x_m"]}
+        reply = idle.ask("obstacle", set=ball)
+        assert reply["error"].startswith("obstacle ball: would lie 0.")
+        until(lambda: idle.status()["tick"] > before["tick"] + 200, lambda: "stands still")
+        after = idle.status()
+        assert (after["state"], after["faults"]) == ("RUN", [])
+        np.testing.assert_allclose(after["q_rad"], before["q_rad"], atol=2e-3)
+
     def test_a_second_controller_on_the_bus_is_refused(self, idle: Rig) -> None:
         second = idle.launch()
         assert second.wait() == EXIT_CONFIG
@@ -312,6 +323,37 @@ def test_drives_scaled_otherwise_than_the_file_says_are_refused_by_joint_and_reg
         f"joint panda_joint5 (id 5): register {register}: got {old.split()[-1].removesuffix('.0')}, wanted 20" in last
     )
     assert "Traceback" not in controller.text
+
+
+# ---- drives that vanish
+
+
+def test_in_lockstep_drives_that_vanish_are_a_fault_and_are_taken_up_again_when_they_return(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        drives = rig.drives()
+        controller = rig.controller()
+        rig.arm()
+        drives.end()
+        assert "link_down" in rig.reach("SAFE_STOP")["faults"]
+        tick = rig.status()["tick"]
+        until(lambda: rig.status()["tick"] > tick + 50, lambda: "stands still")  # it goes on, and answers
+        rig.drives()
+        rig.under_way()
+        controller.signal(signal.SIGTERM)
+        assert controller.wait() == EXIT_OK
+        assert "Traceback" not in controller.text
+
+
+def test_in_lockstep_a_controller_whose_drives_are_gone_ends_when_it_is_told_to(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        drives = rig.drives()
+        controller = rig.controller()
+        rig.arm()
+        drives.end()
+        rig.reach("SAFE_STOP")
+        controller.signal(signal.SIGTERM)
+        assert controller.wait() == EXIT_OK
+        assert "Bad file descriptor" not in controller.text
 
 
 # ---- who listens

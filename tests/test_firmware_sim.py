@@ -17,12 +17,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from firmware_sim.__main__ import QUIET_S
 from firmware_sim.batch import Batch
 from firmware_sim.bus import Hub
 from firmware_sim.camera import Camera
 from firmware_sim.inject import KINDS, parse
 from firmware_sim.settings import SettingsError
 from firmware_sim.simulator import Simulator, open_simulator
+from rtctl.app.vehicle import LOCKSTEP_WAIT
 from rtctl.protocol import e2e, frame, mit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -440,6 +442,11 @@ def test_lockstep_process_says_the_same_as_the_simulator_in_process(tmp_path: Pa
     assert report["periods"] >= 150
     assert report["min_self_clearance_m"] > 0.0
     assert not (tmp_path / "bus").exists()
+
+
+def test_in_lockstep_drives_are_more_patient_than_the_controller_that_waits_for_a_reply() -> None:
+    """Else one reply that is lost would trip all watchdogs, and a test of silence measure the rig."""
+    assert LOCKSTEP_WAIT + 0.5 < QUIET_S
 
 
 @pytest.mark.parametrize("options", [("--lockstep",), ()])

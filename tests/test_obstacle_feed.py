@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from firmware_sim import camera as simulated
 from firmware_sim.simulator import open_simulator
 from rtctl import design as cfg
+from rtctl.app.arm import misplaced
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.sim import simulate
 from rtctl.arm.law import prepared
@@ -538,3 +539,26 @@ def test_the_simulated_camera_sends_what_the_daemon_reads(tmp_path: Path) -> Non
     for key in ("position", "velocity", "omega", "dims"):
         assert np.allclose(getattr(shapes["c"], key), getattr(truth["c"], key), atol=1e-12), key
     assert math.isclose(shapes["c"].velocity[0], -0.2, abs_tol=0.05)  # its centre goes round the origin of its frame
+
+
+def test_where_an_obstacle_would_lie_inside_the_arm_it_is_named():
+    """By the distance of balls: centre to centre less both radii."""
+    here, memory = robot(), Standing().memory
+    P, radius = memory.model.P, here.points.radius
+    for j in range(0, len(P), 7):
+        others = np.linalg.norm(P - P[j], axis=1) - radius - 0.03
+        deepest = int(others.argmin())
+        told = misplaced(here, memory, ObstacleEdit("ball", sphere("ball", P[j], 0.03)))
+        assert told.startswith(f"would lie {-others[deepest]:.3f} m inside {here.points.names[deepest]}")
+    tip = float((np.linalg.norm(P - memory.tip.x, axis=1) - radius).min())
+    beside = memory.tip.x + np.array([0.0, 0.0, -0.3])
+    clear = float((np.linalg.norm(P - beside, axis=1) - radius).min())
+    assert tip < 0.0 < clear
+    near, touching = sphere("ball", beside, clear - 1e-6), sphere("ball", beside, clear + 1e-3)
+    assert misplaced(here, memory, ObstacleEdit("ball", near)) == ""
+    assert misplaced(here, memory, ObstacleEdit("ball", touching)).startswith("would lie 0.001")
+    moved = sphere("ball", beside, 0.01, (0.0, 0.0, 3.0))
+    assert misplaced(here, memory, ObstacleEdit("ball", moved, age=0.1)) != ""  # by now it has come to the tip
+    assert misplaced(here, memory, ObstacleEdit("ball", None)) == ""
+    blob = ObstacleEdit("ball", moved._replace(type="blob"))  # the tick says what is wrong with it
+    assert misplaced(here, memory, blob) == ""

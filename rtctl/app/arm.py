@@ -40,7 +40,8 @@ from rtctl.kernel.rotations import quat_of
 from rtctl.log.entry import Kind
 from rtctl.log.record.checkpoint import encode_checkpoint
 from rtctl.spec.scenario import Scenario
-from rtctl.types import Command, Drive, Feedback, Status, Task
+from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Status, Task
+from rtctl.world import obstacle_table
 
 ArmServo: TypeAlias = Servo[Robot, Memory, Feedback, Command]
 Bus: TypeAlias = Link[Feedback, Command]
@@ -113,6 +114,17 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
     }
 
 
+def misplaced(robot: Robot, m: Memory, edit: ObstacleEdit) -> str:
+    """Return why an obstacle cannot be where a person says, '' where it can: nothing that is real lies inside the arm.
+
+    Taken as told it would be a contact, and the field would drive the arm out of it as fast as its joints may go.
+    """
+    depth, point = obstacle_table.nearest_of(m.world, edit, m.model.P, robot.points.radius)
+    if depth >= 0.0:
+        return ""
+    return f"would lie {-depth:.3f} m inside {robot.points.names[point]}, wanted a place clear of the arm"
+
+
 def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slot], lockstep: bool) -> None:
     """A turn raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
 
@@ -159,6 +171,7 @@ ARM = Vehicle(
     events=events,
     names=faults.names,
     status=status,
+    misplaced=misplaced,
     fallback=fallback,
     farewell=farewell,
     rebuild=rebuild,

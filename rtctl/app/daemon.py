@@ -6,7 +6,7 @@ import select
 import signal
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
@@ -58,24 +58,33 @@ def say(text: str, to: int = 1) -> None:
             os.write(to, line[-4096:])  # PIPE_BUF: what a writable pipe is sure to take
 
 
-def run(config_path: str | Path, lockstep: bool = False, dry: bool = False, timeout: float | None = None) -> int:
+def run(
+    config_path: str | Path,
+    lockstep: bool = False,
+    dry: bool = False,
+    timeout: float | None = None,
+    passing: Collection[int] = (),
+) -> int:
     """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
 
     lockstep: each slot waits for the replies instead of for its time (simulated drives that keep step).
     dry: everything is computed and logged, but only stop frames are sent.
     timeout: [s] that the vehicle is waited for, in place of what the config says.
+    passing: user ids whose hold on the bus does not count, see `InstanceLock`.
     """
     path = Path(config_path)
     vehicle = vehicle_of(path)
     if lockstep and not vehicle.keeps_step:
         raise UsageError("--lockstep is for drives on a bus; `rtctl sim` plays a base in lockstep")
-    return _run(vehicle, vehicle.load(path, timeout), lockstep, dry)
+    return _run(vehicle, vehicle.load(path, timeout), lockstep, dry, passing)
 
 
-def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool, dry: bool) -> int:
+def _run(
+    vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool, dry: bool, passing: Collection[int]
+) -> int:
     signals = Signals()
     with ExitStack() as stack:
-        stack.enter_context(InstanceLock(*setup.resource))
+        stack.enter_context(InstanceLock(*setup.resource, ignore=passing))
         robot = setup.build()
         vehicle.warm(robot)
         link = stack.enter_context(closing(setup.open()))
@@ -87,7 +96,11 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool,
         told = {**header.extra, **surroundings(setup.loop.realtime, link.counters, dry)}
         recorder = _recorder(setup.log, header._replace(extra=told))
         servo = Servo(vehicle, robot, link, recorder, start, dry)
-        console.publish(lambda: status(servo, recorder), lambda: world(servo))
+        console.publish(
+            lambda: status(servo, recorder),
+            lambda: world(servo),
+            lambda edit: vehicle.misplaced(robot, servo.memory, edit),
+        )
         if not lockstep:
             _scheduled(setup.loop, stack.enter_context(clock.light_sleep()))
         service = stack.enter_context(closing(Service(robot.dt)))

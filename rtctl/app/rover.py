@@ -199,6 +199,7 @@ ROVER = Vehicle(
     events=events,
     names=faults.names,
     status=status,
+    misplaced=lambda base, memory, edit: "",  # what is beside a base it sees for itself
     fallback=fallback,
     farewell=farewell,
     rebuild=rebuild,

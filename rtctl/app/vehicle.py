@@ -19,7 +19,7 @@ from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Structured
 from rtctl.spec.robot import ConsoleTable, LogTable
 from rtctl.spec.scenario import Scenario
-from rtctl.types import F64, Record, Request, State, Status
+from rtctl.types import F64, ObstacleEdit, Record, Request, State, Status
 from rtctl.world.obstacle_table import World
 
 Json: TypeAlias = dict[str, Any]  # what is printed or sent as one JSON object
@@ -28,7 +28,9 @@ Said: TypeAlias = tuple[float, str, str]  # robot time [s], name, detail
 Event: TypeAlias = tuple[str, str]  # name and detail, for people
 
 
-LOCKSTEP_WAIT = 2.0  # [s] for replies before a lockstep slot goes on without them: no simulated time passes meanwhile
+# [s] for replies before a lockstep slot goes on without them. No simulated time passes meanwhile: drives in lockstep
+# let none pass either until their controller has been silent for longer than this (firmware_sim.__main__.QUIET_S).
+LOCKSTEP_WAIT = 2.0
 LOCKSTEP_SILENT = 0.05  # [s] the same once a slot went without: a drive that fell silent need not be waited for
 
 
@@ -192,6 +194,7 @@ class Vehicle(NamedTuple, Generic[R, M, F, C]):
     events: Callable[[R, M, M, F], list[Event]]  # what changed from a memory to the next
     names: Callable[[int], tuple[str, ...]]  # of faults
     status: Callable[[R, M, Link[F, C], Sequence[Said]], Json]  # what `rtctl status` shows beside what all have
+    misplaced: Callable[[R, M, ObstacleEdit], str]  # why an obstacle cannot be where a person says, '' where it can
     fallback: Callable[[R, M, Link[F, C], Sink, Iterator[Slot], bool], None]  # a turn raised; bool: in lockstep
     farewell: Callable[[R, M, Link[F, C], Sink], None]  # the last frames
     rebuild: Callable[[Run, Path | None], Rebuilt[R, F, C]]  # a log, another config for it

@@ -24,6 +24,14 @@ def add_before(commands: Commands) -> None:
     run.add_argument("--dry", action="store_true", help="compute and log, but send stop frames alone")
     run.add_argument("--lockstep", action="store_true", help="wait for the drives' replies instead of the clock")
     run.add_argument("--timeout", metavar="S", type=positive, help="wait no longer for a vehicle that is not there yet")
+    run.add_argument(
+        "--pass-lock-of",
+        metavar="USER",
+        action="append",
+        default=[],
+        help="start although a process of USER holds this bus's lock: somebody who keeps the name without a controller "
+        "and cannot be made to give it up",
+    )
 
     warm = command(commands, "warm", "compile ahead what a robot needs", "rtctl warm configs/panda.toml", _warm)
     warm.add_argument("config", metavar="CONFIG", nargs="?", default="", help="default: the source tree's panda.toml")
@@ -73,10 +81,26 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    passing = frozenset(_stranger(name) for name in arguments.pass_lock_of)
     _prepare(arguments.config)
     from rtctl.app.daemon import run
 
-    return run(arguments.config, lockstep=arguments.lockstep, dry=arguments.dry, timeout=arguments.timeout)
+    return run(
+        arguments.config, lockstep=arguments.lockstep, dry=arguments.dry, timeout=arguments.timeout, passing=passing
+    )
+
+
+def _stranger(name: str) -> int:
+    """Return the id of a user whose lock may be passed over. Raises UsageError.
+
+    What this user or root runs may be a controller, and can be ended: two on one bus is what the lock is there against.
+    """
+    from rtctl.trust import trusted_users, user_id
+
+    user = user_id(name)
+    if user in trusted_users():
+        raise UsageError(f"--pass-lock-of: got {name}, wanted a user other than this one and root: end that process")
+    return user
 
 
 def _sim(arguments: argparse.Namespace) -> int:

@@ -36,6 +36,7 @@ STATUS_AGE = 0.02  # [s] for which one snapshot answers every status query
 NOTHING = Request()
 
 StatusFn = Callable[[], dict[str, Any]]
+PlaceFn = Callable[[ObstacleEdit], str]  # why an obstacle cannot be where a person says, '' where it can
 
 
 class _Peer:
@@ -76,12 +77,16 @@ class Console:
         self._credit = BYTES_PER_SLOT  # bytes that may be read before the next ones must wait
         self._status: StatusFn = dict
         self._world: StatusFn = dict
+        self._misplaced: PlaceFn = lambda edit: ""
         self._snapshot, self._snapshot_slot = b"", -1
         self._slot = 0
 
-    def publish(self, status: StatusFn, world: StatusFn = dict) -> None:
-        """Set where snapshots come from. Called only when somebody asks; `status` at most once in STATUS_AGE."""
-        self._status, self._world = status, world
+    def publish(self, status: StatusFn, world: StatusFn = dict, misplaced: PlaceFn = lambda edit: "") -> None:
+        """Set where snapshots come from, and who judges the place of an obstacle that a person tells of.
+
+        Called only when somebody asks or tells; `status` at most once in STATUS_AGE.
+        """
+        self._status, self._world, self._misplaced = status, world, misplaced
 
     def poll(self, slot: int) -> Request:
         """Return the request for the tick of `slot`; call `answer` after that tick. Never blocks, bounded work."""
@@ -198,8 +203,10 @@ class Console:
                 self._reply(peer, {"ok": True, "accepted": len(notices), "refused": self._camera_refusal})
             case _:
                 request = messages.request_of(message, self._bounds, self._orientation, time.monotonic())
-                for edit in request.obstacles:  # newer than what a camera said before
-                    self._forget(edit.name)
+                for edit in request.obstacles:  # a camera is believed: what it sees may have come into contact
+                    if why := self._misplaced(edit):
+                        raise RequestError(f"obstacle {edit.name}: {why}")
+                    self._forget(edit.name)  # newer than what a camera said before
                 self._held = _Held(peer, request)
 
     def _drop(self, peer: _Peer, count: str) -> None:

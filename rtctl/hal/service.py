@@ -79,8 +79,9 @@ class InstanceLock:
     def __init__(self, resource: str, label: str, ignore: Container[int] = ()) -> None:
         """Take the lock of `resource` at once or refuse; `label` names the setting in the refusal.
 
-        ignore: user ids whose hold does not count, when an operator says so. Raises ConfigError when another process
-        holds it, naming process and user.
+        ignore: user ids whose hold does not count (`rtctl run --pass-lock-of`): the name is anybody's to take, so who
+        commands nothing could keep the arm from being started. Raises ConfigError when another process holds it,
+        naming process and user.
         """
         name = "\0rtctl/" + hashlib.sha256(resource.encode()).hexdigest()[:32]
         self._socket: socket.socket | None = None

@@ -180,6 +180,18 @@ def distance_from(world: World, x: F64) -> F64:
     return distances_from(world.obstacles, x)
 
 
+def nearest_of(world: World, edit: ObstacleEdit, P: F64, radius: F64) -> tuple[float, int]:
+    """Return the least distance [m] of spheres at P (m, 3) to the shape of an edit, and which sphere's it is.
+
+    inf and -1 where there is no shape, or none that the table would take: `edited` says why.
+    """
+    there, refusal = edited(empty(1, world.known), (edit,))
+    if refusal or edit.shape is None:
+        return math.inf, -1
+    rho = np.array([distance_from(there, x)[0] for x in P]) - radius
+    return float(rho.min()), int(rho.argmin())
+
+
 @kernel
 def distances_from(obstacles: Obstacles, x: F64) -> F64:
     """Return `distance_from` of a point x (3,) [m]."""

@@ -150,7 +150,11 @@ class Messages:
         if timeout > 0.0 and timeout != self._patience:
             microseconds = int(timeout * 1e6)
             value = np.array([microseconds // 1_000_000, microseconds % 1_000_000], dtype=np.int64).tobytes()
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+            try:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
+            except OSError as error:  # of a bus that is gone: the loop is told as of every other call
+                self.error = error.errno or errno.EBADF
+                return []
             self._patience = timeout
         into = self._in
         if self._ancillary:

@@ -239,7 +239,11 @@ class CanLink:
                 self.bus_state = Link.ERROR_PASSIVE if detail & frame.CRTL_PASSIVE else Link.NONE
 
     def wait_replies(self, timeout: float) -> bool:
-        """Wait until each joint has replied to the last write, for lockstep; False after `timeout` [s] of silence."""
+        """Wait until each joint has replied to the last write, for lockstep; False after `timeout` [s] of silence.
+
+        A bus that is gone answers at once that nothing came: then a period is waited, so that the slots pass as they do
+        in real time, and what is tried again each second is.
+        """
         missing, deadline = set(range(len(self.spec.joints))), time.monotonic() + timeout
         remaining = timeout
         while remaining > 0.0:
@@ -249,6 +253,8 @@ class CanLink:
             if not missing:
                 return True
             if not frames:
+                left = deadline - time.monotonic()
+                time.sleep(min(max(left, 0.0), self.spec.period))
                 return False
             remaining = deadline - time.monotonic()
         return False
