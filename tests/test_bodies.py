@@ -1,6 +1,7 @@
 """Meshes and clouds: true distances and normals, a pre-filter that changes no bit, files that are refused by a line."""
 
 import math
+import re
 from pathlib import Path
 
 import coal
@@ -406,3 +407,29 @@ def test_cloud_files_are_read_as_what_was_written(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=name) as caught:
             load_cloud(tmp_path / name, 0.01, 0.0, "s.toml: obstacle[0].file")
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("size", "scale", "reason"),
+    [
+        (1e30, 1.0, "1e+30 units"),
+        (1e300, 1e4, "1e+300 units"),  # whose product is no number
+        (50.5, 1.0, "a solid of 101 m"),
+        (1e6, 1e-6, ""),  # in micrometres, it is a solid of two metres
+        (1e-30, 1.0, "a solid of 2e-30 m"),
+    ],
+)
+def test_a_mesh_is_as_large_as_solids_are(size: float, scale: float, reason: str, tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "it.obj", box(size, size, size))
+    if not reason:
+        assert len(load_mesh(path, scale, False, "x"))
+        return
+    with pytest.raises(ConfigError, match=re.escape(reason)):
+        load_mesh(path, scale, False, "x")
+
+
+@pytest.mark.parametrize("far", [1e300, -1e30, 9001.0])
+def test_a_cloud_lies_where_places_are(far: float, tmp_path: Path) -> None:
+    np.save(tmp_path / "it.npy", np.full((3, 3), far))
+    with pytest.raises(ConfigError, match="from the origin, wanted at most 9000 m"):
+        load_cloud(tmp_path / "it.npy", 0.01, 0.0, "x")

@@ -219,3 +219,13 @@ def test_an_arm_without_shapes_or_with_flat_ones_is_refused(tmp_path: Path) -> N
     flat.write_text(CROOKED.replace('<sphere radius="0.06"/>', f'<mesh filename="{tmp_path}/flat.stl"/>'))
     with pytest.raises(ConfigError, match="degenerate"):
         place(RigidBody.from_urdf(flat, CROOKED_JOINTS, "tip", np.eye(4)))
+
+
+@pytest.mark.parametrize("radius", ["1e30", "60.0"])
+def test_a_link_in_other_units_than_metres_is_refused_before_it_is_cut_into_triangles(
+    radius: str, tmp_path: Path
+) -> None:
+    huge = tmp_path / "huge.urdf"
+    huge.write_text(CROOKED.replace('<sphere radius="0.06"/>', f'<sphere radius="{radius}"/>'))
+    with pytest.raises(ConfigError, match="from its joint, wanted at most 5 m"):
+        place(RigidBody.from_urdf(huge, CROOKED_JOINTS, "tip", np.eye(4)))

@@ -21,6 +21,7 @@ from rtctl.world.primitives import CLOUD_POINTS, STEP_MAX, STEP_MIN
 from rtctl.world.tree import POINTS_PER_LEAF, ordered
 
 WHOLE = 32767  # steps from the centre, of int16
+PLACE_MAX, SPAN_MAX, SPAN_MIN = 9000.0, 100.0, 1e-4  # [m] as of places and of the largest and smallest obstacles
 COARSER = 1.25  # factor on the voxels of a cloud that has still too many points
 
 
@@ -28,6 +29,19 @@ def files_named(config: Any) -> tuple[str, ...]:
     """Return the files that a config's meshes and obstacles name, an arm's or a base's."""
     named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
     return tuple(sorted({str(name) for name in named if name}))
+
+
+def refuse_extreme(points: F64, scale: float = 1.0, span: bool = True) -> None:
+    """Raise ValueError for points (n, 3) that no obstacle of a robot can have once they are times `scale` [m].
+
+    They lie where places may lie; span: and are as large as solids may be.
+    """
+    far = float(np.abs(points).max(initial=0.0))  # before it is scaled: that may pass what a number can be
+    if far > PLACE_MAX / scale:
+        raise ValueError(f"a point {far:.4g} units of {scale:g} m from the origin, wanted at most {PLACE_MAX:g} m")
+    size = scale * float(np.ptp(points, axis=0).max()) if span and len(points) else SPAN_MIN
+    if not SPAN_MIN <= size <= SPAN_MAX:
+        raise ValueError(f"a solid of {size:.4g} m, wanted {SPAN_MIN:g} to {SPAN_MAX:g} m")
 
 
 class Packed(NamedTuple):
@@ -60,6 +74,7 @@ def packed(points: F64, radius: float, voxel: float = 0.0) -> Packed:
     """
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.all(np.isfinite(points)):
         raise ValueError("wanted one or more rows of three finite numbers")
+    refuse_extreme(points, span=False)
     size = np.ptp(points, axis=0)
     few, index = _thinned(points, voxel)
     voxel = voxel or float(size.max()) / 250.0
@@ -102,6 +117,7 @@ def load_mesh(path: Path, scale: float, hull: bool, place: str) -> F64:
     """Return the body of a mesh file. Raises ConfigError, one line that names `place` and the file."""
     try:
         vertices, triangles = read_mesh(path)
+        refuse_extreme(vertices, scale)
         return mesh_body(vertices * scale, triangles, hull)
     except OSError as error:
         raise ConfigError(place, f"{path}: {(error.strerror or 'unreadable').lower()}", "an STL or OBJ file") from None

@@ -16,6 +16,7 @@ from rtctl.errors import ConfigError
 from rtctl.types import F64, I64
 
 EDGE = 0.012  # [m] longest edge of a surface triangle
+REACH = 5.0  # [m] of a link's geometry from its joint: millimetres taken for metres lie beyond
 STEP = 1e-5  # [m] lengths are rounded to it, so that rounding errors cannot change a choice
 _SIDES = 24  # of the polygons that stand for circles
 
@@ -37,6 +38,9 @@ def solids_of(body: RigidBody) -> list[Solid]:
         local = _corners(thing.geometry, str(thing.name))
         X = thing.placement
         corners = local @ np.array(X.rotation).T + np.array(X.translation)
+        if not (np.abs(corners) <= REACH).all():
+            got = f"a corner {np.abs(corners).max():.4g} m from its joint"
+            raise ConfigError(f"collision geometry {thing.name}", got, f"at most {REACH:g} m")
         name = body.model.frames[thing.parentFrame].name
         try:
             hull = ConvexHull(corners)

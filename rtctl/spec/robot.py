@@ -211,8 +211,10 @@ class ConsoleTable(Table, frozen=True, kw_only=True):
 class DriveTable(Table, frozen=True, kw_only=True):
     """The scales of a drive's fields on the wire; checked against its registers 21-23 before it is enabled."""
 
-    p_max_rad: Annotated[float, Meta(ge=0.1, le=1000.0)]
-    v_max_rad_s: Annotated[float, Meta(ge=0.1, le=1000.0)]
+    # 16 bits of 32 rad are steps of 1 mrad, the coarsest encoder that the bound on jumps expects; 12 bits of 120 rad/s
+    # are steps of 0.06 rad/s, beyond which no reading is small enough for a joint at rest
+    p_max_rad: Annotated[float, Meta(ge=0.1, le=32.0)]
+    v_max_rad_s: Annotated[float, Meta(ge=0.1, le=120.0)]
     t_max_Nm: Annotated[float, Meta(ge=0.01, le=5000.0)]
 
 
