@@ -7,6 +7,7 @@ import pytest
 
 from rtctl.app.arm_scene import ArmTurn
 from rtctl.arm import faults
+from rtctl.arm.faults import jumped
 from rtctl.arm.law import prepared
 from rtctl.types import F64, Link, Request, State, Verb
 from tests.lab import DOWN, Standing, goal, lab, robot
@@ -149,3 +150,26 @@ def test_an_encoder_whose_speed_is_wrong_stops_the_arm():
     seen, after, _, _ = broken("false_velocity@1.0:3", 0.1)
     assert "velocity_mismatch" in seen
     assert 0.0 < after < 0.05
+
+
+@pytest.mark.parametrize(("age_before", "age_now", "apart"), [(1, 1, 1), (3, 1, 3), (1, 3, 2), (2, 3, 2)])
+def test_how_far_a_joint_can_have_moved_goes_by_when_the_two_positions_were_taken(
+    age_before: int, age_now: int, apart: int
+):
+    """Two positions, each some periods old when it came; `apart` periods lie between the moments they tell of."""
+    dt, fastest = 1e-3, 2.0
+    elapsed = (apart - age_before + age_now) * dt
+    reach = 1.5 * fastest * apart * dt + 2e-3
+    for sign in (1.0, -1.0):
+        for share, far in ((0.999, False), (1.001, True)):
+            found = jumped(
+                np.array([sign * share * reach]),
+                np.array([age_now * dt]),
+                np.ones(1, np.int64),
+                np.zeros(1),
+                np.array([age_before * dt]),
+                np.array([fastest]),
+                elapsed,
+                dt,
+            )
+            assert found.tolist() == [far]

@@ -163,3 +163,42 @@ def test_a_key_file_is_for_its_owner_alone(tmp_path):
         read_key(path, "f: link.key_file")
     with pytest.raises(ConfigError, match="No such file"):
         read_key(tmp_path / "none", "f: link.key_file")
+
+
+TOP = (1 << 48) - 1
+GOOD_ROWS = [[0, 0, 0, 0], [255, 255, 255, TOP], [1, 190, 3, 17]]
+
+
+@pytest.mark.parametrize("row", GOOD_ROWS)
+@pytest.mark.parametrize("sent", [0, TOP])
+def test_a_state_at_its_bounds_is_read_back_as_it_was(row, sent):
+    state = State({(row[0], row[1], row[2]): row[3]}, sent)
+    assert signing.from_text(signing.to_text(state)) == state
+
+
+@pytest.mark.parametrize("at", range(4))
+@pytest.mark.parametrize("high", [False, True])
+def test_a_number_of_the_state_beyond_its_bound_is_refused(at, high):
+    row = [1, 1, 1, 1]
+    row[at] = (256, 256, 256, 1 << 48)[at] if high else -1
+    with pytest.raises(ValueError, match="SYSTEM COMPONENT LINK TIMESTAMP"):
+        signing.from_text("sent 1\n" + " ".join(map(str, row)) + "\n")
+
+
+@pytest.mark.parametrize("text", [f"sent {1 << 48}\n", "sent -1\n"])
+def test_our_own_stamp_beyond_48_bits_is_refused(text):
+    with pytest.raises(ValueError, match="beyond 48 bits"):
+        signing.from_text(text)
+
+
+@pytest.mark.parametrize("text", ["", "send 1\n", "sent\n", "sent x\n", "sent 1\n1 1 1\n", "sent 1\n1 1 1 1 1\n", "\n"])
+def test_what_is_no_state_is_refused(text):
+    with pytest.raises(ValueError, match=r"got|invalid|unpack"):
+        signing.from_text(text)
+
+
+def test_as_many_streams_as_are_kept_are_read_and_not_one_more():
+    rows = [f"1 1 {k} 5" for k in range(signing.STREAMS + 1)]
+    assert len(signing.from_text("\n".join(["sent 1", *rows[:-1]])).streams) == signing.STREAMS
+    with pytest.raises(ValueError, match="more streams"):
+        signing.from_text("\n".join(["sent 1", *rows]))

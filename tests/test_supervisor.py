@@ -44,3 +44,34 @@ def test_torque_off_reaches_fault_from_every_state_that_drives():
 def test_without_events_nothing_changes():
     for state in State:
         assert next_state(state, set()) == (state, None)
+
+
+# Every row as the published table of states has it: where each event leads; - where it means nothing.
+WHERE = """
+           STO    SS1        SS2        TERM      STOP       DISARM    RESET     ARM    TIMEOUT  SETTLED  RESTED
+IDLE       FAULT  -          -          IDLE      -          -         IDLE      ARMED  -        -        -
+ARMED      FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      IDLE     RUN      -
+RUN        FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      -        -        -
+STOPPING   FAULT  SAFE_STOP  -          -         SAFE_STOP  -         -         -      -        -        IDLE
+SAFE_STOP  FAULT  SAFE_STOP  -          STOPPING  -          -         STOPPING  -      -        -        -
+FAULT      -      -          -          IDLE      -          -         IDLE      -      -        -        -
+"""
+ROWS = [line.split() for line in WHERE.strip().splitlines()]
+CELLS = [
+    (State[row[0]], Event[event], None if to == "-" else State[to])
+    for row in ROWS[1:]
+    for event, to in zip(ROWS[0], row[1:], strict=True)
+]
+
+
+@pytest.mark.parametrize(("state", "event", "to"), CELLS, ids=lambda value: getattr(value, "name", "-"))
+def test_each_event_leads_where_the_published_table_says(state, event, to):
+    assert next_state(state, {event}) == ((state, None) if to is None else (to, event))
+
+
+def test_what_is_more_urgent_is_taken_and_not_only_known():
+    """A damped stop that lasts is not left by a reset or a TERM that comes in the same tick."""
+    assert next_state(State.SAFE_STOP, {Event.SS1, Event.TERM}) == (State.SAFE_STOP, Event.SS1)
+    assert next_state(State.SAFE_STOP, {Event.SS1, Event.RESET}) == (State.SAFE_STOP, Event.SS1)
+    assert next_state(State.STOPPING, {Event.SS1, Event.RESTED}) == (State.SAFE_STOP, Event.SS1)
+    assert next_state(State.STOPPING, {Event.STOP, Event.RESTED}) == (State.SAFE_STOP, Event.STOP)

@@ -1,0 +1,271 @@
+"""The fault detectors one by one, from the evidence alone: the number that is a fault, and the one next to it.
+
+test_faults.py asks what the arm does about them; here each bound of the published table is met from both sides.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtctl.arm import detection
+from rtctl.arm.faults import (
+    AUTOMATIC,
+    BIT,
+    BRAKES,
+    FAULT_CODES,
+    FAULTS,
+    JUMP_WINDOW,
+    REFUSES_ARMING,
+    STOPS,
+    TABLE,
+    Bounds,
+    Counters,
+    Evidence,
+    counted,
+    describe,
+    detect,
+    names,
+)
+from rtctl.control.faults import GOOD_TICKS, Fault, FaultTable
+from rtctl.types import Feedback, Link, Severity, State
+
+DT = 1e-3
+BOUNDS = Bounds(stale_periods=3, lost_periods=10, feed_timeout=0.5)
+HEALTHY = Evidence(
+    seen=0,
+    age=DT,
+    feed_age=0.0,
+    missed=0,
+    active=True,
+    powered=True,
+    jumped=False,
+    slew_follows_echo=False,
+    armed_outside=False,
+    not_finite=False,
+    has_goal=True,
+    innovation=1.0,
+)
+
+
+def found(link: int = 0, counters: Counters = Counters(), **evidence: Any) -> set[str]:  # noqa: B008 - a frozen value
+    """Return the faults that are present."""
+    return set(names(detect(link, HEALTHY._replace(**evidence), counters, BOUNDS, DT)))
+
+
+BY_EVIDENCE: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
+    ("feedback_stale", {"age": 4 * DT}, {"age": 3 * DT}),
+    ("feedback_lost", {"age": 11 * DT}, {"age": 10 * DT}),
+    ("feedback_lost", {"seen": detection.UNHEARD}, {"seen": 0}),
+    ("drive_fault", {"seen": detection.FAULT}, {"seen": detection.DISABLED}),
+    ("encoder_stuck", {"seen": detection.STUCK}, {"seen": detection.STIRS}),
+    ("velocity_mismatch", {"seen": detection.DISAGREE}, {"seen": detection.TORQUE}),
+    ("not_finite", {"seen": detection.NOT_FINITE}, {"seen": detection.BEYOND}),
+    ("not_finite", {"not_finite": True}, {"not_finite": False}),
+    ("deadline", {"missed": 10}, {"missed": 9}),
+    ("deadline", {"missed": 10}, {"missed": 10, "powered": False}),
+    ("goal_in_obstacle", {"seen": detection.GOAL_INSIDE}, {"seen": detection.GOAL_INSIDE, "has_goal": False}),
+    ("goal_in_obstacle", {"seen": detection.GOAL_INSIDE}, {"seen": 0}),
+    ("contact", {"seen": detection.CONTACT}, {"seen": detection.CONTACT, "active": False}),
+    ("contact", {"seen": detection.CONTACT}, {"seen": 0}),
+    ("feed_stale", {"feed_age": 0.501}, {"feed_age": 0.5}),
+    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.OUTSIDE, "active": False}),
+    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.OUTSIDE, "armed_outside": True}),
+    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.BEYOND}),
+    ("overspeed", {"seen": detection.FAST}, {"seen": detection.FAST, "active": False}),
+    ("overspeed", {"seen": detection.FAST}, {"seen": 0}),
+]
+BY_COUNT: list[tuple[str, dict[str, int], dict[str, int]]] = [
+    ("corrupt_frames", {"corrupt_window": 0b1000010001}, {"corrupt_window": 0b1000010000}),
+    ("send_failed", {"send_failed": 2}, {"send_failed": 1}),
+    ("drive_disabled", {"disabled": 5}, {"disabled": 4}),
+    ("torque_mismatch", {"mismatch": 5}, {"mismatch": 4}),
+    ("torque_mismatch", {"slew_follows_echo": 5}, {"slew_follows_echo": 4}),
+    ("encoder_jump", {"jumps": 0b101}, {"jumps": 0b100}),
+    ("deadline", {"missed": 3}, {"missed": 2}),
+    ("innovation", {"innovation": 5}, {"innovation": 4}),
+]
+BY_FLAG = {
+    Link.DUPLICATE: "duplicate_reply",
+    Link.DISORDER: "disorder",
+    Link.FOREIGN_COMMAND: "foreign_command",
+    Link.OVERFLOW: "rx_overflow",
+    Link.ERROR_PASSIVE: "error_passive",
+    Link.BUS_OFF: "bus_off",
+    Link.DOWN: "link_down",
+    Link.LOG_DEGRADED: "log_degraded",
+}
+
+
+def test_a_healthy_tick_shows_no_fault():
+    assert found() == set()
+
+
+@pytest.mark.parametrize(("name", "there", "near"), BY_EVIDENCE)
+def test_what_is_seen_is_a_fault_at_its_bound_and_not_before(name: str, there: dict[str, Any], near: dict[str, Any]):
+    assert name in found(**there)
+    assert name not in found(**near)
+    assert found(**there) - {name} <= {"feedback_stale"}  # what is lost is stale as well
+
+
+@pytest.mark.parametrize(("name", "there", "near"), BY_COUNT)
+def test_what_is_counted_is_a_fault_at_its_bound_and_not_before(name: str, there: dict[str, int], near: dict[str, int]):
+    assert found(counters=Counters(**there)) == {name}
+    assert found(counters=Counters(**near)) == set()
+
+
+@pytest.mark.parametrize("flag", [flag for flag in Link if flag])
+def test_a_flag_of_the_link_is_its_fault_and_no_other(flag: Link):
+    assert found(link=int(flag)) == ({BY_FLAG[flag]} if flag in BY_FLAG else set())
+
+
+def test_slots_missed_are_no_fault_where_no_torque_flows():
+    assert found(counters=Counters(missed=3), powered=False) == set()
+
+
+# ---- counters
+
+RUNS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [  # counter, what adds to it, what ends it
+    ("send_failed", {"link": int(Link.SEND_FAILED)}, {}),
+    ("disabled", {"seen": detection.DISABLED}, {}),
+    ("disabled", {"seen": detection.DISABLED}, {"seen": detection.DISABLED, "active": False}),
+    ("mismatch", {"seen": detection.TORQUE}, {}),
+    ("mismatch", {"seen": detection.TORQUE}, {"seen": detection.TORQUE, "active": False}),
+    ("slew_follows_echo", {"slew_follows_echo": True}, {}),
+    ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "active": False}),
+    ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "link": int(Link.DERATED)}),
+    ("missed", {"missed": 1}, {}),
+    ("innovation", {"innovation": 8.1}, {"innovation": 8.0}),
+    ("innovation", {"innovation": np.nan}, {"innovation": np.nan, "active": False}),
+]
+
+
+def tick(counters: Counters, link: int = 0, **evidence: Any) -> Counters:
+    """Return the counters after a tick."""
+    return Counters(*counted(link, HEALTHY._replace(**evidence), counters, 8.0))
+
+
+@pytest.mark.parametrize(("name", "adds", "ends"), RUNS)
+def test_ticks_running_are_counted_and_one_without_begins_anew(name: str, adds: dict[str, Any], ends: dict[str, Any]):
+    counters = Counters()
+    for k in range(1, 4):
+        counters = tick(counters, **adds)
+        assert counters == Counters(**{name: k})
+    assert tick(counters, **ends) == Counters()
+
+
+@pytest.mark.parametrize(
+    ("name", "adds", "window"), [("corrupt_window", {"link": int(Link.CORRUPT)}, 10), ("jumps", {"jumped": True}, 50)]
+)
+def test_what_comes_now_and_then_is_counted_within_a_window(name: str, adds: dict[str, Any], window: int):
+    assert JUMP_WINDOW == 50
+    counters = tick(Counters(), **adds)
+    for k in range(window):
+        assert getattr(counters, name) == 1 << k
+        counters = tick(counters)
+    assert counters == Counters()
+    counters = tick(tick(counters, **adds), **adds)
+    assert getattr(counters, name) == 0b11
+
+
+def test_jumps_of_an_arm_that_is_not_driven_are_forgotten():
+    assert tick(Counters(jumps=1), jumped=True, active=False) == Counters()
+
+
+# ---- the table
+
+
+def test_each_word_of_faults_has_the_rows_that_its_name_says():
+    for fault in FAULTS:
+        bit = BIT[fault.name]
+        assert bool(AUTOMATIC & bit) == (fault.clear == "A")
+        assert bool(STOPS & bit) == (fault.severity >= Severity.SS2 and fault.clear != "A")
+        assert bool(BRAKES & bit) == (fault.severity >= Severity.SS2)
+        assert bool(REFUSES_ARMING & bit) == (fault.name != "duplicate_reply")
+        assert names(bit) == (fault.name,)
+        assert TABLE.severity(bit) == fault.severity
+        assert TABLE.stops(bit) == (Severity.NONE if fault.clear == "A" else fault.severity)
+
+
+ROWS = (
+    Fault("passes", 1, Severity.SS2, "A", "by itself"),
+    Fault("stays", 2, Severity.SS1, "R", "until reset"),
+    Fault("lasts", 3, Severity.STO, "L", "until restart"),
+    Fault("told", 4, Severity.LOG, "A", "only told"),
+)
+SMALL = FaultTable.of(ROWS)
+
+
+def test_an_automatic_fault_is_in_force_until_it_was_absent_for_its_ticks_and_the_others_for_good():
+    good = np.full(4, 1 << 30)
+    force, good = SMALL.latch(0b0111, 0, good)
+    assert (force, good.tolist()[:3]) == (0b0111, [0, 0, 0])
+    for k in range(1, GOOD_TICKS):
+        force, good = SMALL.latch(0, force, good)
+        assert (force, good[0]) == (0b0111, k)
+    force, good = SMALL.latch(0, force, good)
+    assert force == 0b0110
+    for _ in range(3 * GOOD_TICKS):
+        force, good = SMALL.latch(0, force, good)
+    assert force == 0b0110
+
+
+def test_one_tick_with_an_automatic_fault_begins_its_absence_anew():
+    force, good = SMALL.latch(1, 0, np.zeros(4, np.int64))
+    for _ in range(GOOD_TICKS - 1):
+        force, good = SMALL.latch(0, force, good)
+    force, good = SMALL.latch(1, force, good)
+    for _ in range(GOOD_TICKS - 1):
+        force, good = SMALL.latch(0, force, good)
+    assert force == 1
+
+
+def test_a_fault_that_was_never_there_is_not_in_force():
+    assert SMALL.latch(0, 0, np.zeros(4, np.int64))[0] == 0
+
+
+def test_a_reset_leaves_what_is_present_and_what_needs_a_restart():
+    assert SMALL.cleared(0b0111, 0) == 0b0100
+    assert SMALL.cleared(0b0111, 0b0010) == 0b0110
+    assert SMALL.cleared(0b0010, 0b1111) == 0b0010
+
+
+def test_the_worst_reaction_counts_and_automatic_faults_stop_nobody_for_good():
+    assert SMALL.severity(0b1011) == Severity.SS1
+    assert SMALL.severity(0b1001) == Severity.SS2
+    assert SMALL.severity(0b0111) == Severity.STO
+    assert SMALL.severity(0) == Severity.NONE
+    assert SMALL.stops(0b1011) == Severity.SS1
+    assert SMALL.stops(0b1001) == Severity.NONE
+
+
+def test_faults_are_told_in_the_order_of_the_table():
+    assert SMALL.names(0b1010) == ("stays", "told")
+    assert SMALL.reasons(0b0110) == "stays (until reset); lasts (until restart)"
+    assert SMALL.reasons(0) == ""
+    assert SMALL.describe(0, State.RUN) == "RUN"
+    told = SMALL.describe(0b0011, State.FAULT, {"stays": "!"})
+    assert told == "FAULT: passes: by itself; stays: until reset!"
+
+
+def feedback(drive: list[int]) -> Feedback:
+    n = len(drive)
+    zero = np.zeros(n)
+    return Feedback(0, 0, zero, zero, zero, zero, np.ones(n, np.int64), np.array(drive), 0, 0.0, 0.0)
+
+
+def test_a_drives_fault_is_told_with_joint_and_code():
+    bit = BIT["drive_fault"]
+    assert "(b: communication lost)" in describe(bit, feedback([1, 0xD, 0]), ("a", "b", "c"), State.RUN)
+    assert "(a: 0x2, c: overload)" in describe(bit, feedback([2, 1, 0xE]), ("a", "b", "c"), State.RUN)
+    assert "(cleared since)" in describe(bit, feedback([1, 1, 0]), ("a", "b", "c"), State.RUN)
+    assert "a:" not in describe(BIT["bus_off"], feedback([0xD]), ("a",), State.RUN)
+    assert FAULT_CODES == {
+        0x8: "over-voltage",
+        0x9: "under-voltage",
+        0xA: "over-current",
+        0xB: "MOS hot",
+        0xC: "coil hot",
+        0xD: "communication lost",
+        0xE: "overload",
+    }
