@@ -7,7 +7,7 @@ import pytest
 
 from rtctl.app.arm_scene import ArmTurn
 from rtctl.arm import faults
-from rtctl.arm.faults import jumped
+from rtctl.arm.faults import implausible_positions
 from rtctl.arm.law import prepared
 from rtctl.types import F64, Link, Request, State, Verb
 from tests.lab import DOWN, Standing, goal, lab, robot
@@ -162,7 +162,7 @@ def test_how_far_a_joint_can_have_moved_goes_by_when_the_two_positions_were_take
     reach = 1.5 * fastest * apart * dt + 2e-3
     for sign in (1.0, -1.0):
         for share, far in ((0.999, False), (1.001, True)):
-            found = jumped(
+            found = implausible_positions(
                 np.array([sign * share * reach]),
                 np.array([age_now * dt]),
                 np.ones(1, np.int64),

@@ -33,13 +33,13 @@ from rtctl.types import Feedback, Link, Severity, State
 DT = 1e-3
 BOUNDS = Bounds(stale_periods=3, lost_periods=10, feed_timeout=0.5)
 HEALTHY = Evidence(
-    seen=0,
+    flags=0,
     age=DT,
     feed_age=0.0,
     missed=0,
     active=True,
     powered=True,
-    jumped=False,
+    implausible=False,
     slew_follows_echo=False,
     armed_outside=False,
     not_finite=False,
@@ -56,24 +56,24 @@ def found(link: int = 0, counters: Counters = Counters(), **evidence: Any) -> se
 BY_EVIDENCE: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     ("feedback_stale", {"age": 4 * DT}, {"age": 3 * DT}),
     ("feedback_lost", {"age": 11 * DT}, {"age": 10 * DT}),
-    ("feedback_lost", {"seen": detection.UNHEARD}, {"seen": 0}),
-    ("drive_fault", {"seen": detection.FAULT}, {"seen": detection.DISABLED}),
-    ("encoder_stuck", {"seen": detection.STUCK}, {"seen": detection.STIRS}),
-    ("velocity_mismatch", {"seen": detection.DISAGREE}, {"seen": detection.TORQUE}),
-    ("not_finite", {"seen": detection.NOT_FINITE}, {"seen": detection.BEYOND}),
+    ("feedback_lost", {"flags": detection.UNHEARD}, {"flags": 0}),
+    ("drive_fault", {"flags": detection.FAULT}, {"flags": detection.DISABLED}),
+    ("encoder_stuck", {"flags": detection.STUCK}, {"flags": detection.STIRS}),
+    ("velocity_mismatch", {"flags": detection.DISAGREE}, {"flags": detection.TORQUE}),
+    ("not_finite", {"flags": detection.NOT_FINITE}, {"flags": detection.BEYOND}),
     ("not_finite", {"not_finite": True}, {"not_finite": False}),
     ("deadline", {"missed": 10}, {"missed": 9}),
     ("deadline", {"missed": 10}, {"missed": 10, "powered": False}),
-    ("goal_in_obstacle", {"seen": detection.GOAL_INSIDE}, {"seen": detection.GOAL_INSIDE, "has_goal": False}),
-    ("goal_in_obstacle", {"seen": detection.GOAL_INSIDE}, {"seen": 0}),
-    ("contact", {"seen": detection.CONTACT}, {"seen": detection.CONTACT, "active": False}),
-    ("contact", {"seen": detection.CONTACT}, {"seen": 0}),
+    ("goal_in_obstacle", {"flags": detection.GOAL_INSIDE}, {"flags": detection.GOAL_INSIDE, "has_goal": False}),
+    ("goal_in_obstacle", {"flags": detection.GOAL_INSIDE}, {"flags": 0}),
+    ("contact", {"flags": detection.CONTACT}, {"flags": detection.CONTACT, "active": False}),
+    ("contact", {"flags": detection.CONTACT}, {"flags": 0}),
     ("feed_stale", {"feed_age": 0.501}, {"feed_age": 0.5}),
-    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.OUTSIDE, "active": False}),
-    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.OUTSIDE, "armed_outside": True}),
-    ("outside_limits", {"seen": detection.OUTSIDE}, {"seen": detection.BEYOND}),
-    ("overspeed", {"seen": detection.FAST}, {"seen": detection.FAST, "active": False}),
-    ("overspeed", {"seen": detection.FAST}, {"seen": 0}),
+    ("outside_limits", {"flags": detection.OUTSIDE}, {"flags": detection.OUTSIDE, "active": False}),
+    ("outside_limits", {"flags": detection.OUTSIDE}, {"flags": detection.OUTSIDE, "armed_outside": True}),
+    ("outside_limits", {"flags": detection.OUTSIDE}, {"flags": detection.BEYOND}),
+    ("overspeed", {"flags": detection.FAST}, {"flags": detection.FAST, "active": False}),
+    ("overspeed", {"flags": detection.FAST}, {"flags": 0}),
 ]
 BY_COUNT: list[tuple[str, dict[str, int], dict[str, int]]] = [
     ("corrupt_frames", {"corrupt_window": 0b1000010001}, {"corrupt_window": 0b1000010000}),
@@ -127,10 +127,10 @@ def test_slots_missed_are_no_fault_where_no_torque_flows():
 
 RUNS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [  # counter, what adds to it, what ends it
     ("send_failed", {"link": int(Link.SEND_FAILED)}, {}),
-    ("disabled", {"seen": detection.DISABLED}, {}),
-    ("disabled", {"seen": detection.DISABLED}, {"seen": detection.DISABLED, "active": False}),
-    ("mismatch", {"seen": detection.TORQUE}, {}),
-    ("mismatch", {"seen": detection.TORQUE}, {"seen": detection.TORQUE, "active": False}),
+    ("disabled", {"flags": detection.DISABLED}, {}),
+    ("disabled", {"flags": detection.DISABLED}, {"flags": detection.DISABLED, "active": False}),
+    ("mismatch", {"flags": detection.TORQUE}, {}),
+    ("mismatch", {"flags": detection.TORQUE}, {"flags": detection.TORQUE, "active": False}),
     ("slew_follows_echo", {"slew_follows_echo": True}, {}),
     ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "active": False}),
     ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "link": int(Link.DERATED)}),
@@ -155,7 +155,8 @@ def test_ticks_running_are_counted_and_one_without_begins_anew(name: str, adds: 
 
 
 @pytest.mark.parametrize(
-    ("name", "adds", "window"), [("corrupt_window", {"link": int(Link.CORRUPT)}, 10), ("jumps", {"jumped": True}, 50)]
+    ("name", "adds", "window"),
+    [("corrupt_window", {"link": int(Link.CORRUPT)}, 10), ("jumps", {"implausible": True}, 50)],
 )
 def test_what_comes_now_and_then_is_counted_within_a_window(name: str, adds: dict[str, Any], window: int):
     assert JUMP_WINDOW == 50
@@ -169,7 +170,7 @@ def test_what_comes_now_and_then_is_counted_within_a_window(name: str, adds: dic
 
 
 def test_jumps_of_an_arm_that_is_not_driven_are_forgotten():
-    assert tick(Counters(jumps=1), jumped=True, active=False) == Counters()
+    assert tick(Counters(jumps=1), implausible=True, active=False) == Counters()
 
 
 # ---- the table

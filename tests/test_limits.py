@@ -70,7 +70,7 @@ def test_the_slew_starts_from_what_the_drive_really_applies():
 @given(sane, sane)
 def test_a_step_that_is_too_large_is_shortened_on_every_joint_alike(wanted, reference):
     """The torque moves from where it is straight towards what is wanted, and no shorter than the slowest joint must."""
-    p = permit(np.zeros(N), wanted, np.zeros(N), reference, MAX, RATE, D, DT)
+    p = limit_torque(TorqueParts(np.zeros(N), wanted), np.zeros(N), reference, BOUNDS, DT)
     start, step = np.clip(reference, -MAX, MAX), RATE * DT
     away = np.clip(wanted, -MAX, MAX) - start
     share = min([1.0, *(step[i] / abs(away[i]) for i in range(N) if abs(away[i]) > step[i])])
@@ -79,5 +79,6 @@ def test_a_step_that_is_too_large_is_shortened_on_every_joint_alike(wanted, refe
 
 
 def test_a_joint_without_a_reference_does_not_hold_up_the_others():
-    p = permit(np.zeros(N), np.ones(N), np.zeros(N), np.array([np.nan, 0.9, 0.9]), MAX, RATE, D, DT)
+    reference = np.array([np.nan, 0.9, 0.9])
+    p = limit_torque(TorqueParts(np.zeros(N), np.ones(N)), np.zeros(N), reference, BOUNDS, DT)
     np.testing.assert_allclose(p.tau, [0.0, 1.0, 1.0])
