@@ -15,8 +15,8 @@ BASE_BEGIN, BASE_END = "<!-- faults of a base: printed by `python -m tools.fault
 
 def table(faults: tuple[Fault, ...] = FAULTS) -> str:
     """Return a fault table as Markdown."""
-    rows = ["| fault | what it means | reaction | clears |", "|---|---|---|---|"]
-    rows += [f"| `{f.name}` | {f.text} | {f.severity.name} | {f.clear} |" for f in faults]
+    rows = ["| fault | what it means | reaction | clears | untrue then |", "|---|---|---|---|---|"]
+    rows += [f"| `{f.name}` | {f.text} | {f.severity.name} | {f.clear} | {', '.join(f.untrue)} |" for f in faults]
     return "\n".join(rows) + "\n"
 
 

@@ -26,32 +26,63 @@ FAULT_CODES = {
 }
 
 
+MOTION = ("position", "speed")  # what an encoder tells
+ALL = (*MOTION, "torque")
+
 FAULTS = (
     Fault("feedback_stale", 2, Severity.SS2, "A", "a joint was silent for more than 3 periods"),
-    Fault("feedback_lost", 2, Severity.SS1, "R", "a joint was silent for more than 10 periods"),
+    Fault("feedback_lost", 2, Severity.SS1, "R", "a joint was silent for more than 10 periods", ("link",)),
     Fault("duplicate_reply", 4, Severity.LOG, "A", "a joint answered more than once in a cycle"),
     Fault("disorder", 5, Severity.SS2, "R", "replies keep overtaking each other"),
     Fault("corrupt_frames", 6, Severity.SS2, "R", "3 of 10 cycles had a frame with a wrong CRC, length or id"),
-    Fault("foreign_command", 8, Severity.SS1, "L", "somebody else sends our command ids"),
+    Fault("foreign_command", 8, Severity.SS1, "L", "somebody else sends our command ids", ("torque",)),
     Fault("rx_overflow", 9, Severity.LOG, "A", "the receive queue overflowed"),
     Fault("error_passive", 10, Severity.LOG, "A", "the controller went error-passive"),
-    Fault("bus_off", 11, Severity.SS1, "R", "the controller went bus-off"),
-    Fault("send_failed", 12, Severity.SS1, "R", "commands were dropped in two ticks running"),
-    Fault("link_down", 13, Severity.SS1, "R", "the interface is down or gone"),
+    Fault("bus_off", 11, Severity.SS1, "R", "the controller went bus-off", ("link",)),
+    Fault("send_failed", 12, Severity.SS1, "R", "commands were dropped in two ticks running", ("link",)),
+    Fault("link_down", 13, Severity.SS1, "R", "the interface is down or gone", ("link",)),
     Fault("drive_fault", 15, Severity.SS1, "R", "a drive reports a fault"),
     Fault("drive_disabled", 17, Severity.SS1, "R", "a drive left the enabled state by itself"),
-    Fault("torque_mismatch", 18, Severity.SS1, "R", "a drive's torque is not the one it was sent"),
-    Fault("encoder_stuck", 19, Severity.SS1, "R", "a position stands still though the joint must move"),
-    Fault("encoder_jump", 20, Severity.SS1, "R", "a position jumped twice by more than the joint can move"),
-    Fault("velocity_mismatch", 21, Severity.SS1, "R", "a joint's speed is not that of its positions"),
-    Fault("not_finite", 25, Severity.SS1, "L", "a state or torque was not finite"),
+    Fault("torque_mismatch", 18, Severity.SS1, "R", "a drive's torque is not the one it was sent", ("torque",)),
+    Fault(
+        "encoder_stuck",
+        19,
+        Severity.SS1,
+        "R",
+        "a position stands still though the joint must move",
+        ("position", "speed"),
+    ),
+    Fault(
+        "encoder_jump",
+        20,
+        Severity.SS1,
+        "R",
+        "a position jumped twice by more than the joint can move",
+        ("position", "speed"),
+    ),
+    Fault(
+        "velocity_mismatch",
+        21,
+        Severity.SS1,
+        "R",
+        "a joint's speed is not that of its positions",
+        ("position", "speed"),
+    ),
+    Fault("not_finite", 25, Severity.SS1, "L", "a state or torque was not finite", MOTION),
     Fault("deadline", 30, Severity.SS2, "R", "3 slots running, or 10 periods, were missed"),
     Fault("goal_in_obstacle", 43, Severity.SS2, "A", "the goal lies inside an obstacle"),
     Fault("contact", 44, Severity.SS2, "R", "an obstacle touches a point of the arm"),
     Fault("feed_stale", 45, Severity.SS2, "A", "a moving obstacle was not observed for too long"),
     Fault("outside_limits", 50, Severity.SS1, "R", "a joint is beyond its limit"),
     Fault("overspeed", 50, Severity.SS1, "R", "a joint is faster than its limit allows"),
-    Fault("innovation", 21, Severity.SS1, "R", "measurement and estimate disagree beyond the bound"),
+    Fault(
+        "innovation",
+        21,
+        Severity.SS1,
+        "R",
+        "measurement and estimate disagree beyond the bound",
+        ("position", "speed", "torque"),
+    ),
     Fault("log_degraded", 51, Severity.LOG, "A", "the log cannot be written; arming is refused"),
 )
 TABLE = FaultTable.of(FAULTS)
@@ -62,6 +93,10 @@ STOPS, BRAKES = (  # bits of the faults that ask for SS2 or more: those that an 
     sum(1 << i for i, fault in enumerate(FAULTS) if fault.severity >= Severity.SS2 and fault.clear in clear)
     for clear in ("RL", "ARL")
 )
+DISTRUST = sum(  # bits of the faults after which a torque that follows from the measurements may drive the arm away
+    1 << i for i, fault in enumerate(FAULTS) if {"position", "speed", "torque"} & set(fault.untrue)
+)
+ASTRAY = DISTRUST | BIT["contact"] | BIT["outside_limits"]  # while it stops: it does not go as it should
 _DISABLED, _TORQUE, _JUMPS = detection.DISABLED, detection.TORQUE, (1 << JUMP_WINDOW) - 1
 _CORRUPT, _SEND_FAILED, _DERATED = (
     int(Link.CORRUPT),

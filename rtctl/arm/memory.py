@@ -32,6 +32,8 @@ HOT = np.dtype(
             ("state", _INT),  # types.State
             ("since", _INT),  # tick of entering the state
             ("reaction", _INT),  # types.Severity of SAFE_STOP and FAULT, NONE elsewhere
+            ("onset", _REAL, _JOINT),  # [rad/s] speeds on entering the state
+            ("onset_faults", _INT),  # bits of the faults present then
             ("off", _INT),  # SAFE_STOP has cut the torque and will not give it back
             ("present", _INT),  # bits of the faults seen this tick
             ("in_force", _INT),  # bits of the faults
@@ -105,7 +107,7 @@ HOT = np.dtype(
 )
 _NAMES = frozenset(HOT.names or ())
 _COLD = ("hot", "n", "verdict", "blocked_by", "model", "parameters", "placed", "table", "shapes")
-_JOINTS = ("qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
+_JOINTS = ("onset", "qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
 _FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "slew_follows_echo")
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtctl.arm.escape import Phase
-from rtctl.arm.faults import STOPS
+from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
@@ -44,6 +44,8 @@ MISSED_MAX = 10  # slots that estimates coast through; more is a fault
 REST_HOLD = 0.1  # [s] at rest before the drives are disabled
 SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque builds up at its rate limit
 ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
+FADE = 0.01  # [s] in which the torque of a stop without true measurements goes
+FASTER = 0.3  # [rad/s] above its speed at the onset of a stop: the joint is driven, not damped
 STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushing, brakes do the rest
 
 # numbers of the enumerations, as compiled code reads them
@@ -94,11 +96,29 @@ def _torque_asked(c: Any, m: Any, f: Feedback) -> int:
 
 
 @kernel
-def _damped_stop(c: Any, m: Any, f: Feedback, g: F64) -> F64:
-    """Return the torque (n,) [Nm] of a damped stop, -D qd + g, and note when it is over."""
-    over = (m.tick - m.since) * c.dt >= c.stop_time or m.rest * c.dt >= REST_HOLD
-    if over:
+def _astray(c: Any, m: Any, n: int) -> bool:
+    """Return whether an arm that is stopping is faster than when it began to, or something new went wrong with it."""
+    if m.present & ASTRAY & ~m.onset_faults:
+        return True
+    for i in range(n):
+        if abs(m.qd[i]) > abs(m.onset[i]) + FASTER:
+            return True
+    return False
+
+
+@kernel
+def _stop_torque(c: Any, m: Any, f: Feedback, g: F64) -> F64:
+    """Return the torque (n,) [Nm] of a stop, and note when it is over.
+
+    Where the measurements are true it is damped: -D qd + g. Where one of them lies, -D qd and the g of the next
+    posture drive the arm away: then g fades within FADE, and the brakes have it.
+    """
+    since = (m.tick - m.since) * c.dt
+    distrust = m.in_force & DISTRUST != 0
+    if since >= (FADE if distrust else c.stop_time) or m.rest * c.dt >= REST_HOLD or _astray(c, m, g.shape[0]):
         m.off = 1
+    if distrust:
+        return g * max(1.0 - since / FADE, 0.0)
     keep = np.empty(g.shape[0])
     for i in range(g.shape[0]):  # a velocity that old damps nothing
         fresh = 1.0 if f.age[i] <= c.safety_lost_periods * c.dt else 0.0
@@ -148,8 +168,8 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
     n = f.q.shape[0]
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
-    if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp -D qd + g, then torque off
-        drive, keep = np.zeros(n), _damped_stop(c, m, f, model.g)
+    if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp or fade, then torque off
+        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g)
     command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
     bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
     limited, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)

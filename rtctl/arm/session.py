@@ -69,7 +69,7 @@ def _timed(robot: Robot, m: Memory, enabled: bool) -> frozenset[Event]:
 
 def _entered(robot: Robot, m: Memory) -> Memory:
     """Return the memory on entering a state: every motion begins from what is measured now."""
-    m = free_of_goals(m)._replace(off=False)
+    m = free_of_goals(m)._replace(off=False, onset=m.joints.qd, onset_faults=m.present)
     if m.state in (State.ARMED, State.RUN):
         m = m._replace(v_ref=np.zeros(3), w_ref=np.zeros(3))
     return held_here(robot, m)

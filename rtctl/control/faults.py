@@ -20,6 +20,7 @@ class Fault(NamedTuple):
     severity: Severity
     clear: str  # A = by itself after GOOD_TICKS, R = operator's reset, L = restart of the daemon
     text: str
+    untrue: tuple[str, ...] = ()  # what of position, speed, torque, link may no longer be believed
 
 
 @kernel
