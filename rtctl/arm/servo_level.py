@@ -117,9 +117,10 @@ def _stop_torque(c: Any, m: Any, f: Feedback, g: F64) -> F64:
     distrust = m.in_force & DISTRUST != 0
     if since >= (FADE if distrust else c.stop_time) or m.rest * c.dt >= REST_HOLD or _astray(c, m, g.shape[0]):
         m.off = 1
+    keep = g.copy()
     if distrust:
-        return g * max(1.0 - since / FADE, 0.0)
-    keep = np.empty(g.shape[0])
+        keep *= max(1.0 - since / FADE, 0.0)
+        return keep
     for i in range(g.shape[0]):  # a velocity that old damps nothing
         fresh = 1.0 if f.age[i] <= c.safety_lost_periods * c.dt else 0.0
         keep[i] = g[i] - c.stop_damping[i] * m.qd[i] * fresh
