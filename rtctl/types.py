@@ -5,7 +5,7 @@ Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
 
 from collections.abc import Sequence
 from enum import STRICT, IntEnum, IntFlag
-from typing import Any, NamedTuple, Protocol, overload
+from typing import Any, NamedTuple, Protocol, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -281,3 +281,5 @@ class Simulator(Protocol):
 
 
 Record = NDArray[Any]  # one element of arm.record.record_dtype(n, K)
+RecordRow: TypeAlias = Any  # an element of a structured array: numpy has no static type of its fields
+Array: TypeAlias = NDArray[Any]  # of any kind of number

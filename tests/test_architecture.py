@@ -1,7 +1,8 @@
-"""The structure of the program, read from its own imports: no circle, wherever an import stands."""
+"""The structure of the program, read from its own source: no circle, short parameter lists, few untyped values."""
 
 import ast
 import re
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -99,3 +100,47 @@ def test_the_map_names_every_room():
     for path in sorted((ROOT / "rtctl").iterdir()):
         if path.is_dir() and (path / "__init__.py").exists():
             assert f"`rtctl/{path.name}/`" in text, path.name
+
+
+PARAMETERS_MAX, ANY_MAX, SKIP_MAX = 9, 120, 15
+
+
+def crowded(source: str) -> list[str]:
+    """Return the functions, nested ones and lambdas included, that take more than PARAMETERS_MAX, `self` counted."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            a = node.args
+            if len([*a.posonlyargs, *a.args, *a.kwonlyargs]) > PARAMETERS_MAX:
+                found.append(f"{getattr(node, 'name', 'lambda')}:{node.lineno}")
+    return found
+
+
+def tokens(path: Path) -> list[tokenize.TokenInfo]:
+    with path.open("rb") as file:
+        return list(tokenize.tokenize(file.readline))
+
+
+def test_a_long_parameter_list_is_found():
+    nine, ten = (", ".join(f"p{i}" for i in range(n)) for n in (9, 10))
+    assert crowded(f"def f({nine}): ...\nclass A:\n  def g(self, {nine}): ...\nasync def h(*, {ten}): ...") == [
+        "h:4",
+        "g:3",
+    ]
+
+
+def test_no_function_takes_more_than_nine_parameters():
+    found = {name: crowded(path.read_text(encoding="utf-8")) for name, path in modules("rtctl").items()}
+    assert {name: functions for name, functions in found.items() if functions} == {}
+
+
+def test_any_stands_only_where_no_type_says_more():
+    used = {name: sum(t.string == "Any" for t in tokens(path)) for name, path in modules("rtctl").items()}
+    assert sum(used.values()) <= ANY_MAX, sorted((n, name) for name, n in used.items() if n)
+
+
+def test_the_formatter_is_switched_off_for_tables_alone():
+    rooms = ("rtctl", "firmware_sim", "tools", "tests")
+    files = [path for room in rooms for path in modules(room).values()]
+    comments = [t.string for path in files for t in tokens(path) if t.type == tokenize.COMMENT]
+    assert sum(bool(re.search("fmt: (skip|off)", text)) for text in comments) <= SKIP_MAX

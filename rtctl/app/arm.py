@@ -19,7 +19,6 @@ from rtctl.app.vehicle import (
     LOCKSTEP_WAIT,
     Checkpoints,
     Event,
-    Json,
     Link,
     Said,
     Setup,
@@ -39,6 +38,7 @@ from rtctl.hal.service import bus_resource
 from rtctl.kernel.rotations import quat_of
 from rtctl.log.entry import Kind
 from rtctl.log.record.checkpoint import encode_checkpoint
+from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario
 from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Status, Task
 from rtctl.world import obstacle_table

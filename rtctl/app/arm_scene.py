@@ -8,13 +8,14 @@ import numpy as np
 
 from rtctl.app.stream import Follower, Seen
 from rtctl.app.tally import Leg, number, of_way
-from rtctl.app.vehicle import Json, Link, Said, Turn
+from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.design.assets import load_assets
 from rtctl.errors import ConfigError, PlanError
 from rtctl.kernel.rotations import R_of, quat_of
+from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, goal_of
 from rtctl.types import F64, Command, Drive, Feedback, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
 from rtctl.world import obstacle_table

@@ -16,7 +16,7 @@ import numpy as np
 
 from rtctl.app.choose import vehicle_of
 from rtctl.app.servo import Servo
-from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, C, F, Json, Loop, M, R, Setup, Vehicle
+from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, C, F, Loop, M, R, Setup, Vehicle
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 from rtctl.hal import clock
 from rtctl.hal.client import default_path
@@ -25,6 +25,7 @@ from rtctl.hal.console import Console
 from rtctl.hal.service import InstanceLock, Service
 from rtctl.log.header import Header
 from rtctl.log.record.recorder import Recorder
+from rtctl.plain import Json
 from rtctl.spec.robot import LogTable
 from rtctl.types import Link, State, Verb
 from rtctl.world.primitives import MESH

@@ -12,12 +12,13 @@ import numpy as np
 from rtctl.app.rover_link import RoverLink, open_link
 from rtctl.app.rover_log import header_of, rebuild
 from rtctl.app.rover_scene import open_play
-from rtctl.app.vehicle import Event, Json, Link, Said, Setup, Sink, Vehicle, clearances
+from rtctl.app.vehicle import Event, Link, Said, Setup, Sink, Vehicle, clearances
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
 from rtctl.hal.messages import Bounds
 from rtctl.hal.service import bus_resource
 from rtctl.log.entry import Kind
+from rtctl.plain import Json
 from rtctl.rover import faults
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.pipe import initial, tick, warm

@@ -9,9 +9,10 @@ import numpy as np
 from rtctl.app.rover_link import RoverLink, open_link
 from rtctl.app.simulator import open_simulator
 from rtctl.app.tally import Leg, number, of_way
-from rtctl.app.vehicle import Json, Said, Turn
+from rtctl.app.vehicle import Said, Turn
 from rtctl.errors import ConfigError
 from rtctl.hal.mavlink.wire import InProcess
+from rtctl.plain import Json
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.robot import Base
 from rtctl.rover.signals import BaseCommand, BaseFeedback

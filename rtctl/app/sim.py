@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 from rtctl.app.choose import vehicle_of
 from rtctl.app.servo import Servo
 from rtctl.app.tally import number
-from rtctl.app.vehicle import C, F, Json, M, Play, R, Turn
+from rtctl.app.vehicle import C, F, M, Play, R, Turn
 from rtctl.hal.clock import lockstep
+from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
 
 Watch: TypeAlias = Callable[[Any, Any, Any], None]  # is shown servo, truth and turn of the vehicle after each period

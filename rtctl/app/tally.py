@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.app.vehicle import Json
+from rtctl.plain import Json
 from rtctl.types import F64, Goal
 
 

@@ -17,12 +17,12 @@ from rtctl.hal.messages import Bounds
 from rtctl.log.header import Header
 from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Structured
+from rtctl.plain import Json
 from rtctl.spec.robot import ConsoleTable, LogTable
 from rtctl.spec.scenario import Scenario
 from rtctl.types import F64, ObstacleEdit, Record, Request, State, Status
 from rtctl.world.obstacle_table import World
 
-Json: TypeAlias = dict[str, Any]  # what is printed or sent as one JSON object
 Say: TypeAlias = Callable[[str], None]
 Said: TypeAlias = tuple[float, str, str]  # robot time [s], name, detail
 Event: TypeAlias = tuple[str, str]  # name and detail, for people

@@ -38,7 +38,7 @@ class Balance(NamedTuple):
     edge: bool  # the tip is as far in the goal's direction as the links are long
 
 
-class Drive(NamedTuple):
+class GoalDrive(NamedTuple):
     """What drives the tip to its goal: tau_m = J^T Lambda F."""
 
     F: F64  # (6,) [m/s2, rad/s2] that the goal asks for
@@ -47,7 +47,7 @@ class Drive(NamedTuple):
     Lambda: F64  # (6, 6)
 
 
-class Opposed(NamedTuple):
+class OpposingTorques(NamedTuple):
     """The torques that oppose it, each (n,) [Nm]."""
 
     own: F64  # of links near each other, as the field alone gives it
@@ -104,8 +104,8 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
     )
     obstacles, limits, own, granted = _shares(
-        Drive(_drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda),
-        Opposed(tau_own, m.tau_obstacles, tau_limits),
+        GoalDrive(_drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda),
+        OpposingTorques(tau_own, m.tau_obstacles, tau_limits),
         robot.scratch,
         m.model.Jp,
         robot.points.link,
@@ -132,7 +132,7 @@ def _drive(robot: Robot, m: Memory) -> F64:
 
 @kernel
 def _shares(
-    drive: Drive, opposed: Opposed, field: Field, Jp: F64, link: I64, gaps: LimitGaps
+    drive: GoalDrive, opposed: OpposingTorques, field: Field, Jp: F64, link: I64, gaps: LimitGaps
 ) -> tuple[F64, F64, float, float]:
     """Return the fields of `Balance` from `obstacles` to `granted`; Jp (m, 3, n) and link (m,) of the points."""
     F, J, A_inv, Lambda = drive

@@ -5,7 +5,7 @@
 Sorted for the limiter into what drives towards the goal and what must be kept.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from rtctl.arm.osc import (
 from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
 from rtctl.arm.scaling import scale_drive_to_limits, scale_to_limits
 from rtctl.kernel import kernel, leaf_kernel
-from rtctl.types import F64, I32, I64, Cut, Record
+from rtctl.types import F64, I32, I64, Cut, Record, RecordRow
 from rtctl.world.primitives import Obstacles
 
 _CAP, _SPEED, _SINGULAR = (int(c) for c in (Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR))
@@ -166,7 +166,7 @@ def prepared(robot: Robot) -> Robot:
     that it gives each record type in each process, so that of two layouts from its cache one would run as the other.
     Whoever replaces a gain or bound of a robot prepares it anew.
     """
-    groups: dict[str, Any] = {
+    groups: dict[str, NamedTuple] = {
         "motion": robot.motion,
         "avoid": robot.avoid,
         "own": robot.self_avoid,
@@ -199,7 +199,7 @@ def prepared(robot: Robot) -> Robot:
 
 
 @kernel
-def motion_params(c: Any) -> MotionParams:
+def motion_params(c: RecordRow) -> MotionParams:
     """Return the parameters of the motion task in the record c; what it has of joints is padded."""
     return MotionParams(
         c.motion_k_p,
@@ -228,7 +228,7 @@ class _Params(NamedTuple):
 
 
 @leaf_kernel
-def _params(c: Any, n: int) -> _Params:
+def _params(c: RecordRow, n: int) -> _Params:
     """Return the parameters of n joints in the record c."""
     return _Params(
         MotionParams(
@@ -277,7 +277,7 @@ def _params(c: Any, n: int) -> _Params:
 
 
 @leaf_kernel
-def _motion_limits(c: Any, n: int, speed_scale: float, qd_max: F64) -> MotionLimits:
+def _motion_limits(c: RecordRow, n: int, speed_scale: float, qd_max: F64) -> MotionLimits:
     """Return the limits of n joints in the record c; qd_max (n,) is where the speeds of this tick are put."""
     for i in range(n):
         qd_max[i] = speed_scale * c.qd_max[i]
@@ -454,7 +454,7 @@ def _hold_back(constants: Record, cover: Cover, seen: Field, model: Model, motio
 
 
 @leaf_kernel
-def _approach(c: Any) -> ApproachParams:
+def _approach(c: RecordRow) -> ApproachParams:
     return ApproachParams(c.avoid_rho0, c.own_rho_min, c.motion_v_max, c.motion_a_max)
 
 

@@ -16,7 +16,8 @@ from rtctl.arm.flat import AGE, GOAL_RHO, MARGIN, RHO, model_in, row_of, shapes_
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.arm.robot import JOINTS_MAX
-from rtctl.types import F64, Goal, Record, Severity, State, Status, Task
+from rtctl.plain import Json
+from rtctl.types import F64, I64, Goal, Record, RecordRow, Severity, State, Status, Task
 from rtctl.world.obstacle_table import World
 
 FAULTS_MAX = 64  # bits of a word
@@ -137,7 +138,7 @@ class Memory(msgspec.Struct, frozen=True):
         return row[..., : self.n] if name in _JOINTS or name in ("sent", "watch") else row
 
     @property
-    def good(self) -> Any:
+    def good(self) -> I64:
         """Return the ticks (faults,) since each fault was present."""
         return record_of(self.hot)["good"][0, : len(FAULTS)]
 
@@ -250,7 +251,7 @@ def fresh() -> F64:
     return np.zeros(HOT.itemsize // 8)
 
 
-def write(hot: F64, changes: dict[str, Any]) -> None:
+def write(hot: F64, changes: Json) -> None:
     """Write values into a hot record by the names of Memory."""
     h = record_of(hot)[0]
     for name, value in changes.items():
@@ -282,7 +283,7 @@ def write(hot: F64, changes: dict[str, Any]) -> None:
             h[name] = value
 
 
-def _write_goal(h: Any, goal: Goal | None) -> None:
+def _write_goal(h: RecordRow, goal: Goal | None) -> None:
     h["has_goal"] = goal is not None
     if goal is None:
         for name in ("goal", "goal_wxyz", "goal_axis", "goal_task", "goal_tolerance", "goal_tolerance_rot"):

@@ -4,9 +4,9 @@
 start, and one compiled kernel turns them into a `Model`: fresh arrays, no BLAS, equal bits for equal inputs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -259,9 +259,9 @@ class RigidBody:
     Links are numbered 0 = base and everything fixed to it, i = whatever joint i-1 of `names` carries.
     """
 
-    def __init__(self, model: Any, geometry: Any, names: Sequence[str], tip_frame: str) -> None:
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel, names: Sequence[str], tip_frame: str) -> None:
         self.model, self.geometry, self.names = model, geometry, tuple(names)
-        self.data: Any = model.createData()
+        self.data: pin.Data = model.createData()
         joints = [model.getJointId(name) for name in self.names]
         n = len(joints)
         self._iq: I64 = np.array([model.idx_qs[j] for j in joints], dtype=np.int64)
@@ -385,7 +385,7 @@ class RigidBody:
         return own.distances(*self.placements(q))
 
 
-def _held(placements: Any) -> tuple[F64, F64]:
+def _held(placements: Iterable[pin.SE3]) -> tuple[F64, F64]:
     """Return views of all rotations (joints, 3, 3) and translations (joints, 3) [m] of a vector of Pinocchio's SE3.
 
     They follow each other in memory at equal steps, so that one view each serves instead of two a joint.
@@ -402,7 +402,7 @@ def _held(placements: Any) -> tuple[F64, F64]:
     )
 
 
-def _check_names(place: str, model: Any, joint_names: Sequence[str], tip_frame: str) -> None:
+def _check_names(place: str, model: pin.Model, joint_names: Sequence[str], tip_frame: str) -> None:
     """Refuse joints and frames the URDF does not have, and joints of more than one degree of freedom."""
     movable = [name for name, nv in zip(model.names, model.nvs, strict=True) if nv == 1]
     for k, name in enumerate(joint_names):
@@ -417,7 +417,7 @@ def _check_names(place: str, model: Any, joint_names: Sequence[str], tip_frame: 
         raise ConfigError(f"{place}: tip_frame", tip_frame, f"one of {', '.join(frames)}")
 
 
-def _move_base(model: Any, geometry: Any, base_pose: F64) -> None:
+def _move_base(model: pin.Model, geometry: pin.GeometryModel, base_pose: F64) -> None:
     """Put the root at X_WB: whatever hangs on the universe moves, gravity stays along the world's -z."""
     X = pin.SE3(np.asarray(base_pose, dtype=np.float64))
     for j in range(1, model.njoints):

@@ -4,13 +4,13 @@ The ring, the log and the replay all carry these bytes; a field added here appea
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, I32, U32, Feedback
+from rtctl.types import F64, I32, U32, Feedback, RecordRow
 
 
 @cache
@@ -114,7 +114,7 @@ def _put_record(out: U32, at: int, values: F64, longs: F64) -> int:
 
 @kernel
 def pack(
-    m: Any,
+    m: RecordRow,
     f: Feedback,
     o: Outcome,
     errors: tuple[float, float, float],

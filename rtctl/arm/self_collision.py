@@ -6,7 +6,7 @@ a compact arm's forearm and hand by centimetres, so the distance itself is measu
 plane is found to hold farther apart than is asked about.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -23,7 +23,7 @@ class Hull(NamedTuple):
 
     link: int  # 0 is the base
     name: str
-    shape: Any  # coal's
+    shape: coal.CollisionGeometry
     corners: F64  # (v, 3) [m] points whose hull it is
     centre: F64  # (3,) [m] of a ball around it
     radius: float  # [m]

@@ -7,7 +7,7 @@ read in place, as the fields of an object would be.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from rtctl.arm.target import target_of
 from rtctl.control.faults import latch_with
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, largest
-from rtctl.types import B1, F64, Cut, Feedback, State
+from rtctl.types import B1, F64, Cut, Feedback, RecordRow, State
 from rtctl.world.primitives import Obstacles
 
 REST_SPEED = 0.03  # [rad/s] a joint slower than this rests (encoders of MIT drives resolve 0.005)
@@ -52,7 +52,7 @@ class Surroundings(NamedTuple):
 
 
 @kernel
-def drives_torque(m: Any) -> bool:
+def drives_torque(m: RecordRow) -> bool:
     """Return whether the state wants torque from the drives."""
     if m.state == _SAFE_STOP:
         return bool(m.off == 0)
@@ -60,7 +60,7 @@ def drives_torque(m: Any) -> bool:
 
 
 @kernel
-def plausible_feedback(c: Any, m: Any, f: Feedback) -> tuple[Feedback, bool]:
+def plausible_feedback(c: RecordRow, m: RecordRow, f: Feedback) -> tuple[Feedback, bool]:
     """Return the feedback with silence in place of positions that no joint can have reached, and whether any is.
 
     A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump.
@@ -81,7 +81,7 @@ def plausible_feedback(c: Any, m: Any, f: Feedback) -> tuple[Feedback, bool]:
 
 
 @kernel
-def _estimator(c: Any) -> EstimatorParams:
+def _estimator(c: RecordRow) -> EstimatorParams:
     return EstimatorParams(
         c.estimator_sigma_a,
         c.estimator_sigma_alpha,
@@ -93,29 +93,29 @@ def _estimator(c: Any) -> EstimatorParams:
 
 
 @kernel
-def _joint_filter(c: Any, n: int) -> JointParams:
+def _joint_filter(c: RecordRow, n: int) -> JointParams:
     return JointParams(
         c.joint_sigma_qdd[:n].copy(), c.joint_r_q[:n].copy(), c.joint_r_qd[:n].copy(), c.joint_has_qd != 0.0
     )
 
 
 @kernel
-def _joints(m: Any, n: int) -> JointEstimate:
+def _joints(m: RecordRow, n: int) -> JointEstimate:
     return JointEstimate(m.q[:n].copy(), m.qd[:n].copy(), m.P[:n].copy())
 
 
 @kernel
-def _tip(m: Any) -> TipEstimate:
+def _tip(m: RecordRow) -> TipEstimate:
     return TipEstimate(m.x.copy(), m.xd.copy(), m.P_tip.copy(), m.R.copy(), m.omega.copy(), m.P_rot.copy())
 
 
 @kernel
-def _put_tip(m: Any, tip: TipEstimate) -> None:
+def _put_tip(m: RecordRow, tip: TipEstimate) -> None:
     m.x[:], m.xd[:], m.P_tip[:], m.R[:], m.omega[:], m.P_rot[:] = tip.x, tip.xd, tip.P, tip.R, tip.omega, tip.P_rot
 
 
 @kernel
-def predict(c: Any, m: Any, f: Feedback, model: Model, elapsed: float) -> bool:
+def predict(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: float) -> bool:
     """Advance joints and tip to this slot; return whether the model must be evaluated, or its task space."""
     n = f.q.shape[0]
     qdd = m.qdd[:n].copy()
@@ -137,7 +137,7 @@ def predict(c: Any, m: Any, f: Feedback, model: Model, elapsed: float) -> bool:
 
 
 @kernel
-def correct(c: Any, m: Any, model: Model) -> None:
+def correct(c: RecordRow, m: RecordRow, model: Model) -> None:
     """Correct the tip by the twist J qd and, where the model was evaluated, by its pose."""
     n = model.q.shape[0]
     twist = np.zeros(6)
@@ -159,7 +159,7 @@ def correct(c: Any, m: Any, model: Model) -> None:
 
 
 @kernel
-def _monitored(c: Any, m: Any, f: Feedback, A: F64) -> tuple[F64, int]:
+def _monitored(c: RecordRow, m: RecordRow, f: Feedback, A: F64) -> tuple[F64, int]:
     """Return the monitors of the encoders after this tick, and their flags."""
     n = f.q.shape[0]
     return encoder_flags(
@@ -173,7 +173,7 @@ def _monitored(c: Any, m: Any, f: Feedback, A: F64) -> tuple[F64, int]:
 
 
 @kernel
-def detect_faults(c: Any, m: Any, f: Feedback, A: F64, around: Surroundings, implausible: bool) -> None:
+def detect_faults(c: RecordRow, m: RecordRow, f: Feedback, A: F64, around: Surroundings, implausible: bool) -> None:
     """Write the faults that are present and in force, and what the detectors keep; f: plausible feedback."""
     n = f.q.shape[0]
     powered = drives_torque(m)

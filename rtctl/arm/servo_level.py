@@ -6,7 +6,7 @@ What is rare is left to Python: where it is wanted, the call ends with a flag, a
 The memory (`memory.HOT`) is copied once and written as the tick goes on; nobody but the caller sees the copy.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from rtctl.arm.target import progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
-from rtctl.types import F64, U32, Drive, Feedback, Severity, State, Task
+from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Task
 from rtctl.world.obstacle_table import distances_from, margins
 from rtctl.world.primitives import advanced_pose
 
@@ -70,7 +70,7 @@ def asking(stage: int, bits: int, verb: int) -> int:
 
 
 @kernel
-def _uneventful(c: Any, m: Any, enabled: bool) -> bool:
+def _uneventful(c: RecordRow, m: RecordRow, enabled: bool) -> bool:
     """Return whether nothing moves the supervisor: no fault that stops, and nothing whose time has come."""
     if m.in_force & STOPS or (m.in_force != 0 and (m.state == _SAFE_STOP or m.state == _FAULT)):
         return False
@@ -84,7 +84,7 @@ def _uneventful(c: Any, m: Any, enabled: bool) -> bool:
 
 
 @kernel
-def _torque_asked(c: Any, m: Any, f: Feedback) -> int:
+def _torque_asked(c: RecordRow, m: RecordRow, f: Feedback) -> int:
     """Return what is asked of the drives, types.Drive."""
     if drives_torque(m):
         return _TORQUE if m.state != _ARMED or all_equal(f.drive, 1) else _ENABLE
@@ -96,7 +96,7 @@ def _torque_asked(c: Any, m: Any, f: Feedback) -> int:
 
 
 @kernel
-def _astray(c: Any, m: Any, n: int) -> bool:
+def _astray(c: RecordRow, m: RecordRow, n: int) -> bool:
     """Return whether an arm that is stopping is faster than when it began to, or something new went wrong with it."""
     if m.present & ASTRAY & ~m.onset_faults:
         return True
@@ -107,7 +107,7 @@ def _astray(c: Any, m: Any, n: int) -> bool:
 
 
 @kernel
-def _stop_torque(c: Any, m: Any, f: Feedback, g: F64) -> F64:
+def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, g: F64) -> F64:
     """Return the torque (n,) [Nm] of a stop, and note when it is over.
 
     Where the measurements are true it is damped: -D qd + g. Where one of them lies, -D qd and the g of the next
@@ -139,7 +139,7 @@ def _move(around: Surroundings, dt: float) -> None:
 
 
 @kernel
-def _sense(c: Any, m: Any, f: Feedback, model: Model, around: Surroundings, asked: Asked) -> int:
+def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, asked: Asked) -> int:
     """Run the first half of a tick; return what Python must do before the other, and whether the obstacles moved."""
     plausible, implausible = plausible_feedback(c, m, f)
     moved = DONE
@@ -165,7 +165,7 @@ def _sense(c: Any, m: Any, f: Feedback, model: Model, around: Surroundings, aske
 
 
 @kernel
-def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
+def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
     n = f.q.shape[0]
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
@@ -185,7 +185,7 @@ def _limited(c: Any, m: Any, f: Feedback, model: Model, torques: F64) -> tuple[i
 
 @kernel
 def _act(
-    arm: Arm, m: Any, model: Model, space: OperationalSpace, around: Surroundings, f: Feedback, asked: Asked
+    arm: Arm, m: RecordRow, model: Model, space: OperationalSpace, around: Surroundings, f: Feedback, asked: Asked
 ) -> tuple[U32, int]:
     """Run the second half of a tick; return its record in words, and what `progress_timers` asks for."""
     c, n = arm.constants[0], f.q.shape[0]

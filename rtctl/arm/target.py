@@ -4,7 +4,7 @@ The target is chosen once a tick, here. m, c: as in `sensing`.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from rtctl.arm.task import point_along, selected, task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, norm
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, TOOL_Z, State, Status
+from rtctl.types import F64, TOOL_Z, RecordRow, State, Status
 
 START_SPEED_SCALE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
@@ -46,7 +46,7 @@ class Target(NamedTuple):
 
 
 @kernel
-def target_of(m: Any, goal: bool) -> Target:
+def target_of(m: RecordRow, goal: bool) -> Target:
     """Return the goal of the memory, or what it holds."""
     if goal:
         return Target(
@@ -58,12 +58,12 @@ def target_of(m: Any, goal: bool) -> Target:
 
 
 @kernel
-def _braking(m: Any) -> bool:
+def _braking(m: RecordRow) -> bool:
     return bool(m.state == _STOPPING or m.state == _SAFE_STOP or m.in_force & BRAKES != 0)
 
 
 @kernel
-def pursues(m: Any) -> bool:
+def pursues(m: RecordRow) -> bool:
     """Return whether the tip is on its way to the goal."""
     return bool(m.has_goal != 0 and m.state == _RUN and not _braking(m))
 
@@ -81,7 +81,7 @@ def _largest_size(v: F64) -> float:
 
 
 @kernel
-def _hold_here(c: Any, m: Any) -> None:
+def _hold_here(c: RecordRow, m: RecordRow) -> None:
     n_q = m.q.shape[0]
     m.hold[:], m.hold_wxyz[:] = m.x, quat_of(m.R)
     m.hold_task, m.hold_tolerance, m.hold_tolerance_rot = int(c.axes), 0.0, 0.0
@@ -91,7 +91,7 @@ def _hold_here(c: Any, m: Any) -> None:
 
 
 @kernel
-def _escape_of(m: Any) -> Escape:
+def _escape_of(m: RecordRow) -> Escape:
     return Escape(
         m.escape_phase,
         m.escape_hit,
@@ -104,12 +104,12 @@ def _escape_of(m: Any) -> Escape:
 
 
 @kernel
-def _circulates(m: Any) -> bool:
+def _circulates(m: RecordRow) -> bool:
     return bool(m.escape_phase == _FIRST or m.escape_phase == _OTHER)
 
 
 @kernel
-def _escape(c: Any, m: Any, model: Model, chosen: bool, e: F64) -> F64:
+def _escape(c: RecordRow, m: RecordRow, model: Model, chosen: bool, e: F64) -> F64:
     """Advance an escape by a tick, unless its side was `chosen` in it; return the error (3,) [m] of the tip to follow.
 
     e (3,) [m]: what it is without an escape that circulates.
@@ -128,7 +128,7 @@ def _escape(c: Any, m: Any, model: Model, chosen: bool, e: F64) -> F64:
 
 
 @kernel
-def wanted(c: Any, m: Any, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
+def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
     """Choose the target; return the errors e (3,) [m] and e_rot (3,) [rad] of the tip, and the posture (n,) [rad].
 
     Writes the share of their speed that joints may have: an arm that wakes inside a field leaves it slowly.
@@ -155,7 +155,7 @@ def wanted(c: Any, m: Any, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
 
 
 @kernel
-def _forget_goal(m: Any) -> None:
+def _forget_goal(m: RecordRow) -> None:
     m.has_goal, m.goal_task, m.goal_tolerance, m.goal_tolerance_rot, m.has_posture = 0, 0, 0.0, 0.0, 0
     m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:] = 0.0, 0.0, 0.0, 0.0
     m.status, m.still, m.nearest, m.stall_timer = _NO_GOAL, 0, np.inf, 0.0
@@ -164,13 +164,13 @@ def _forget_goal(m: Any) -> None:
 
 
 @kernel
-def _no_escape(m: Any) -> None:
+def _no_escape(m: RecordRow) -> None:
     m.escape_phase, m.escape_hit, m.escape_ticks, m.escape_slow = _NONE, np.inf, 0, 0
     m.escape_n[:], m.escape_b[:], m.escape_costs[:] = 0.0, 0.0, 0.0
 
 
 @kernel
-def _take_status(m: Any, status: int) -> int:
+def _take_status(m: RecordRow, status: int) -> int:
     if m.status == status:
         return SAME
     m.status, m.blocker, m.blockers = status, -1, np.uint64(0)
@@ -178,13 +178,13 @@ def _take_status(m: Any, status: int) -> int:
 
 
 @kernel
-def _waited(c: Any, m: Any) -> bool:
+def _waited(c: RecordRow, m: RecordRow) -> bool:
     """Return whether the arm has been at rest, or got no nearer to its goal, for long enough to ask what holds it."""
     return bool(max(m.still * c.dt, m.stall_timer) >= c.stop_stall - 0.5 * c.dt)
 
 
 @kernel
-def progress_timers(c: Any, m: Any, target: Target, p: Progress) -> int:
+def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> int:
     """Advance the timers of the way to the goal; return DIAGNOSE when it is time to ask what holds the arm."""
     if m.has_goal == 0 or m.state != _RUN:
         if m.status == _NO_GOAL:

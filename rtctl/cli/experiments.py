@@ -5,10 +5,13 @@ import json
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, command
 from rtctl.errors import EXIT_OK, UsageError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 
 def add(commands: Commands) -> None:
@@ -55,7 +58,7 @@ def _list(as_json: bool) -> int:
     return EXIT_OK
 
 
-def _moved(progress: Any, task: Any, part: float) -> None:
+def _moved(progress: "Progress", task: "TaskID", part: float) -> None:
     progress.update(task, completed=part)
 
 

@@ -5,11 +5,12 @@ import json
 import math
 import time
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtctl.cli.values import goal_messages
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError
 from rtctl.hal.client import Session, accepted
+from rtctl.plain import Json
 
 POLL = 0.05  # [s] between two looks at the status
 ARRIVED = "arrived"
@@ -36,7 +37,7 @@ class Outcome(NamedTuple):
         word = self.why if self.arrived else f"NOT REACHED: {self.why}"
         print(f"goal {where}  {word}  {self.time:.2f} s  {self._missed()}", flush=True)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Return the outcome for --json; what is unknown is null."""
         known = {key: None if math.isnan(value) else value for key, value in self._errors().items()}
         return {"position_m": self.position, "arrived": self.arrived, "why": self.why, "time_s": self.time, **known}
@@ -50,18 +51,18 @@ class Outcome(NamedTuple):
         return {"error_m": self.error, "error_rad": self.error_rot}
 
 
-def send(session: Session, message: dict[str, Any]) -> dict[str, Any]:
+def send(session: Session, message: Json) -> Json:
     """Return the daemon's reply. Raises RequestError with its reason."""
     return accepted(session.ask(message))
 
 
-def send_and_wait(session: Session, message: dict[str, Any], timeout: float) -> Outcome:
+def send_and_wait(session: Session, message: Json, timeout: float) -> Outcome:
     """Return what became of a goal within `timeout` [s]. Raises RequestError when it is refused at once."""
     send(session, message)
     return awaited(session, message, timeout)
 
 
-def awaited(session: Session, message: dict[str, Any], timeout: float, near: float = 0.0) -> Outcome:
+def awaited(session: Session, message: Json, timeout: float, near: float = 0.0) -> Outcome:
     """Return what became of the goal of `message` within `timeout` [s]; one that is `near` [m] counts as passed."""
     wanted, begin = message.get("position_m"), time.monotonic()
     while True:
@@ -83,7 +84,7 @@ def awaited(session: Session, message: dict[str, Any], timeout: float, near: flo
 def run_stream(session: Session, lines: Iterable[str], source: str, arguments: argparse.Namespace) -> int:
     """Send the goals in `lines` one after another and return the exit code. Raises UsageError, RequestError."""
     failed = 0
-    last: dict[str, Any] | None = None
+    last: Json | None = None
     for at, message in goal_messages(lines, source):
         try:
             if arguments.rate:
@@ -108,7 +109,7 @@ def run_stream(session: Session, lines: Iterable[str], source: str, arguments: a
     return EXIT_FAILED if failed else EXIT_OK
 
 
-def _end(status: dict[str, Any], wanted: list[float] | None) -> str:
+def _end(status: Json, wanted: list[float] | None) -> str:
     """Return why the goal is over, or nothing while it is pursued."""
     state = str(status.get("state"))
     if state not in MOVING_STATES:
@@ -120,7 +121,7 @@ def _end(status: dict[str, Any], wanted: list[float] | None) -> str:
     return ARRIVED if status.get("status") == ARRIVED else ""
 
 
-def _known(value: Any) -> float:
+def _known(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 

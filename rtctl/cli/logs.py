@@ -4,13 +4,17 @@ import argparse
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtctl.cli import pictures, replays
-from rtctl.cli.parser import Commands, command, log_file, positive
+from rtctl.cli.parser import Commands, Parser, command, log_file, positive
 from rtctl.cli.progress import bar
 from rtctl.cli.values import table
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
+from rtctl.plain import Json
+
+if TYPE_CHECKING:
+    from rtctl.types import RecordRow
 
 
 def add(commands: Commands) -> None:
@@ -81,7 +85,7 @@ does the copy replace a .open file, or stand beside any other.
 Exit code 0: nothing was lost; 3: whole, but something was lost; 1: failed."""
 
 
-def _file(parser: Any) -> None:
+def _file(parser: Parser) -> None:
     parser.add_argument("file", metavar="FILE", type=log_file)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -94,7 +98,7 @@ def _info(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _text(found: dict[str, Any]) -> str:
+def _text(found: Json) -> str:
     state = "complete" if found["complete"] else f"cut off, {found['torn_bytes']} bytes torn"
     head = [
         ("file", f"{found['path']}, {found['bytes'] / 1e6:.2f} MB, {state}"),
@@ -254,7 +258,7 @@ def _tail(arguments: argparse.Namespace) -> int:
         time.sleep(0.1)
 
 
-def _say(event: dict[str, Any], as_json: bool) -> None:
+def _say(event: Json, as_json: bool) -> None:
     if as_json:
         print(json.dumps({k: v for k, v in event.items() if k != "evidence"}), flush=True)
         return
@@ -263,7 +267,7 @@ def _say(event: dict[str, Any], as_json: bool) -> None:
     print(f"{at if isinstance(at, int | float) else 0.0:10.3f} s  {text}", flush=True)
 
 
-def _state(record: Any) -> dict[str, Any]:
+def _state(record: "RecordRow") -> Json:
     import numpy as np
 
     from rtctl.log.read.fields import called
@@ -281,7 +285,7 @@ def _state(record: Any) -> dict[str, Any]:
     }
 
 
-def _line(record: Any) -> str:
+def _line(record: "RecordRow") -> str:
     s = _state(record)
     near = "" if s["clearance_m"] is None else f"clearance {s['clearance_m'] * 1e3:.1f} mm"
     x = " ".join(f"{v:+.3f}" for v in s["x_m"])

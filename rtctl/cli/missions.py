@@ -2,9 +2,9 @@
 
 import json
 import math
-from typing import Any
 
 from rtctl.errors import UsageError
+from rtctl.plain import Json
 
 WAYPOINT = 16  # MAV_CMD_NAV_WAYPOINT
 HEAD = "QGC WPL"
@@ -23,7 +23,7 @@ def goals_of(text: str, source: str) -> list[str]:
     return [json.dumps(_goal(*item, f"{source}: item {k}")) for k, item in enumerate(items, 1)]
 
 
-Item = tuple[Any, Any, list[Any]]  # command, frame, seven parameters
+Item = tuple[object, object, list[object]]  # command, frame, seven parameters
 
 
 def _of_plan(text: str, source: str) -> list[Item]:
@@ -53,20 +53,20 @@ def _of_lines(text: str, source: str) -> list[Item]:
     return found
 
 
-def _goal(command: Any, frame: Any, params: list[Any], place: str) -> dict[str, Any]:
+def _goal(command: object, frame: object, params: list[object], place: str) -> Json:
     if command != WAYPOINT:
         raise UsageError(f"{place}: got command {command}, wanted way-points alone (MAV_CMD_NAV_WAYPOINT, {WAYPOINT})")
     if frame not in GLOBAL_FRAMES:
         raise UsageError(f"{place}: got frame {frame}, wanted latitude and longitude")
     latitude, longitude = (_number(value, place) for value in (params + [None] * 7)[4:6])
-    goal: dict[str, Any] = {"latlon_deg": [latitude, longitude]}
+    goal: Json = {"latlon_deg": [latitude, longitude]}
     radius = params[1] if len(params) > 1 and params[1] else 0.0
     if radius:
         goal["tolerance_m"] = min(_number(radius, place), TOLERANCE_MAX)
     return goal
 
 
-def _number(value: Any, place: str) -> float:
+def _number(value: object, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise UsageError(f"{place}: got {value}, wanted a number")
     return float(value)

@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_OK, RtctlError, UsageError
+from rtctl.plain import Json
 
 
 def add_before(commands: Commands) -> None:
@@ -163,7 +163,7 @@ def _schema(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _schema_of(what: str) -> dict[str, Any]:
+def _schema_of(what: str) -> Json:
     from rtctl import design
 
     if what in ("config", "base"):

@@ -5,10 +5,14 @@ import json
 import math
 import sys
 import time
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, Parser, add_daemon, command, daemon_of, number, positive
 from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, UsageError
+from rtctl.plain import Json
+
+if TYPE_CHECKING:
+    from rtctl.hal.client import Session
 
 VERBS = {
     "arm": "enable the drives; the arm holds where it is",
@@ -118,13 +122,13 @@ def _add_obstacle(commands: Commands) -> None:
     add_daemon(clear)
 
 
-def _demand(arguments: argparse.Namespace, message: dict[str, Any]) -> dict[str, Any]:
+def _demand(arguments: argparse.Namespace, message: Json) -> Json:
     from rtctl.hal.client import demand
 
     return demand(daemon_of(arguments), message, arguments.reply)
 
 
-def _said(reply: dict[str, Any], default: str) -> int:
+def _said(reply: Json, default: str) -> int:
     print(reply.get("text") or default)
     return EXIT_OK
 
@@ -139,7 +143,7 @@ def _verb(arguments: argparse.Namespace) -> int:
         return _armed(session)
 
 
-def _armed(session: Any) -> int:
+def _armed(session: "Session") -> int:
     """Wait until the robot runs; print why it does not, in the vehicle's own words where it has any."""
     from rtctl.hal.client import accepted
 
@@ -167,7 +171,7 @@ def _set(arguments: argparse.Namespace) -> int:
     return _said(_demand(arguments, {"verb": "obstacle", "set": described}), f"obstacle {arguments.name}: set")
 
 
-def _set_cloud(arguments: argparse.Namespace, described: dict[str, Any]) -> int:
+def _set_cloud(arguments: argparse.Namespace, described: Json) -> int:
     """Read the points here, where the file is, and send them as one binary message."""
     from pathlib import Path
 
@@ -203,7 +207,7 @@ def _goal(arguments: argparse.Namespace) -> int:
     from rtctl.cli.values import letters
     from rtctl.hal.client import Session
 
-    message: dict[str, Any] = {"verb": "goal", **_place(arguments)}
+    message: Json = {"verb": "goal", **_place(arguments)}
     if arguments.axes == "none":
         message.pop("position_m", None)
     elif arguments.axes is not None:
@@ -226,7 +230,7 @@ def _goal(arguments: argparse.Namespace) -> int:
     return EXIT_OK if outcome.arrived else EXIT_FAILED
 
 
-def _place(arguments: argparse.Namespace) -> dict[str, Any]:
+def _place(arguments: argparse.Namespace) -> Json:
     """Return where a goal is. Raises UsageError."""
     if arguments.latlon is not None:
         if arguments.x is not None:
@@ -258,7 +262,7 @@ def _status(arguments: argparse.Namespace) -> int:
 
     with Session(daemon_of(arguments), arguments.reply) as session:
 
-        def ask() -> dict[str, Any]:
+        def ask() -> Json:
             return accepted(session.ask({"verb": "status"}))
 
         if arguments.json:

@@ -5,7 +5,6 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from rtctl.design.arm import loaded_shape
 from rtctl.design.assets import Assets, load_assets
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError, UsageError
 from rtctl.hal.client import Session, accepted
+from rtctl.plain import Json
 from rtctl.spec.obstacles import orientation_contradiction, quaternion
 from rtctl.spec.scenario import load_scenario
 from rtctl.types import F64, Goal, ObstacleEdit, Task
@@ -49,20 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _goal(arguments: argparse.Namespace, robot: Robot) -> Goal:
-    if found := orientation_contradiction(_tuple(arguments.rpy), _tuple(arguments.wxyz)):
+    if found := orientation_contradiction(arguments.rpy, arguments.wxyz):
         raise UsageError(f"--{found[0]}: got {found[1]}, wanted {found[2]}")
     oriented = arguments.rpy is not None or arguments.wxyz is not None
     return Goal(
         np.array(arguments.to),
-        quaternion(_tuple(arguments.rpy), _tuple(arguments.wxyz)),
+        quaternion(arguments.rpy, arguments.wxyz),
         Task.POSE if oriented else Task.POSITION,
         robot.tolerance,
         robot.tolerance_rot,
     )
-
-
-def _tuple(values: list[float] | None) -> Any:
-    return None if values is None else tuple(values)
 
 
 def _described(arguments: argparse.Namespace, robot: Robot) -> tuple[F64, Obstacles]:
@@ -110,7 +106,7 @@ def _with_daemon(arguments: argparse.Namespace, robot: Robot, goal: Goal) -> int
 
 
 def _follow(session: Session, follower: Follower, arguments: argparse.Namespace) -> int:
-    begun, elapsed, status = time.monotonic(), 0.0, dict[str, Any]()
+    begun, elapsed, status = time.monotonic(), 0.0, Json()
     while not follower.over:
         status = accepted(session.ask({"verb": "status"}))
         elapsed = time.monotonic() - begun
@@ -130,7 +126,7 @@ def _follow(session: Session, follower: Follower, arguments: argparse.Namespace)
     return EXIT_OK if arrived else EXIT_FAILED
 
 
-def _step(session: Session, follower: Follower, status: dict[str, Any]) -> None:
+def _step(session: Session, follower: Follower, status: Json) -> None:
     """Give the sub-goal that is due, and tell of new plans."""
     seen = Seen(status["status"], status["detail"], np.array(status["x_m"]), np.array(status["q_rad"]))
     goal = follower.next(seen)
@@ -141,7 +137,7 @@ def _step(session: Session, follower: Follower, status: dict[str, Any]) -> None:
         send(session, {"verb": "goal", **message_of(goal)})
 
 
-def obstacles_told(reply: dict[str, Any], robot: Robot) -> Obstacles:
+def obstacles_told(reply: Json, robot: Robot) -> Obstacles:
     """Return the obstacles of a daemon's answer to `world`. Raises RequestError for those that it cannot tell of."""
     known, rows = obstacles_empty(robot.slots, robot.meshes), reply["obstacles"]
     count = len(reply["names"])
@@ -160,9 +156,9 @@ def obstacles_told(reply: dict[str, Any], robot: Robot) -> Obstacles:
     return known
 
 
-def message_of(goal: Goal) -> dict[str, Any]:
+def message_of(goal: Goal) -> Json:
     """Return a goal, no direction, as the control socket and the lines of `rtctl goals` have it."""
-    message: dict[str, Any] = {"position_m": goal.position.tolist()}
+    message: Json = {"position_m": goal.position.tolist()}
     axes = [axis for i, axis in enumerate("xyz") if int(goal.task) >> i & 1]
     if len(axes) < 3:
         message["axes"] = axes

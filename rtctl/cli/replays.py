@@ -3,11 +3,16 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, command, log_file
 from rtctl.cli.progress import bar
 from rtctl.errors import EXIT_FAILED, EXIT_OK
+from rtctl.plain import Json
+
+if TYPE_CHECKING:
+    from rtctl.app.replay import Replay
+    from rtctl.log.read.run import Run
 
 REPLAY_EXAMPLE = "rtctl log replay run.mcap\n  rtctl log replay run.mcap --config softer.toml --plot softer.png"
 REPLAY_TEXT = """Run the pure tick once more on the inputs of a log, from the log alone: its config, URDF and meshes.
@@ -63,7 +68,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     return EXIT_OK if done.identical or other is not None else EXIT_FAILED
 
 
-def _as_dict(done: Any, other: Path | None) -> dict[str, Any]:
+def _as_dict(done: "Replay", other: Path | None) -> Json:
     import numpy as np
 
     gap = done.replayed - done.logged
@@ -81,7 +86,7 @@ def _as_dict(done: Any, other: Path | None) -> dict[str, Any]:
     }
 
 
-def _text(done: Any, other: Path | None, run: Any) -> str:
+def _text(done: "Replay", other: Path | None, run: "Run") -> str:
     import numpy as np
 
     from rtctl.cli.values import table
@@ -89,7 +94,7 @@ def _text(done: Any, other: Path | None, run: Any) -> str:
     lines = [f"{done.ticks} ticks, {done.frames} command frames, {done.speed:.1f} x real time"]
     if done.ignored:
         lines.append(f"not compared, only one side knows them: {', '.join(done.ignored)}")
-    if done.identical:
+    if done.divergence is None:
         return "\n".join([*lines, f"identical to the bit{f', digest {done.digest}' if done.digest else ''}"])
     d = done.divergence
     what = "first divergence" if other is None else f"{other} commands otherwise from"
@@ -115,7 +120,7 @@ def _text(done: Any, other: Path | None, run: Any) -> str:
     return "\n".join(lines)
 
 
-def _blame(run: Any) -> str:
+def _blame(run: "Run") -> str:
     """Return what is different about the program that wrote the log."""
     from rtctl.log.header import revision, versions
 

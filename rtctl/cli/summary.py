@@ -1,10 +1,10 @@
 """The outcome of a simulated scenario as people read it."""
 
-from typing import Any
-
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from rtctl.plain import Json
 
 WIDTH = 96  # columns of a summary that goes into a file or pipe
 STATUSES_SHOWN = 24
@@ -21,7 +21,7 @@ FIGURES = (
 )
 
 
-def show(result: dict[str, Any], scenario: str, log: str) -> None:
+def show(result: Json, scenario: str, log: str) -> None:
     """Print the tables of a result of `simulate`."""
     console = Console(highlight=False)
     if not console.is_terminal:
@@ -40,7 +40,7 @@ def show(result: dict[str, Any], scenario: str, log: str) -> None:
         console.print(f"log {log}", style="dim", soft_wrap=True)
 
 
-def _headline(result: dict[str, Any], scenario: str) -> Text:
+def _headline(result: Json, scenario: str) -> Text:
     arrived, contacts = bool(result.get("arrived")), int(result.get("contacts") or 0)
     faults = result.get("faults") or ()
     return Text.assemble(
@@ -61,7 +61,7 @@ def _table(*columns: str) -> Table:
     return table
 
 
-def _goals(result: dict[str, Any]) -> Table:
+def _goals(result: Json) -> Table:
     table = _table("goal at", "reached after", "error", "rotation", "off the line")
     rows = result.get("goals") or ()
     if not rows and result.get("final_error_m") is not None:
@@ -79,7 +79,7 @@ def _goals(result: dict[str, Any]) -> Table:
     return table
 
 
-def _clearances(result: dict[str, Any]) -> Table:
+def _clearances(result: Json) -> Table:
     table = _table("obstacle", "smallest clearance")
     found = result.get("min_clearance_m") or {}
     for name, distance in found.items():
@@ -89,7 +89,7 @@ def _clearances(result: dict[str, Any]) -> Table:
     return table
 
 
-def _figures(result: dict[str, Any]) -> Table:
+def _figures(result: Json) -> Table:
     table = _table("over the run", "")
     for key, words, factor, unit, digits in FIGURES:
         if key in result:
@@ -97,7 +97,7 @@ def _figures(result: dict[str, Any]) -> Table:
     return table
 
 
-def _statuses(result: dict[str, Any]) -> Table:
+def _statuses(result: Json) -> Table:
     table = Table(box=None, padding=(0, 2), pad_edge=False, header_style="dim")
     table.add_column("at", justify="right")
     table.add_column("status")

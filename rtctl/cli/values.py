@@ -4,9 +4,9 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 from rtctl.errors import UsageError
+from rtctl.plain import Json
 
 COLUMNS = {3: ("x", "y", "z"), 6: ("x", "y", "z", "roll", "pitch", "yaw"), 7: ("x", "y", "z", "qw", "qx", "qy", "qz")}
 GROUPS = {
@@ -23,9 +23,9 @@ NEEDED = (*GROUPS, "hold")  # one of them: where to go
 WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz or dx,dy,dz; lat,lon; or a JSON object"
 
 
-def assignments(words: Iterable[str]) -> dict[str, Any]:
+def assignments(words: Iterable[str]) -> Json:
     """Return `key=value` words as a dict: numbers, lists of numbers by commas, JSON, or text. Raises UsageError."""
-    found: dict[str, Any] = {}
+    found: Json = {}
     for word in words:
         key, equals, text = word.partition("=")
         if not (key and equals and text):
@@ -36,7 +36,7 @@ def assignments(words: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-def goal_messages(lines: Iterable[str], source: str) -> Iterator[tuple[int, dict[str, Any]]]:
+def goal_messages(lines: Iterable[str], source: str) -> Iterator[tuple[int, Json]]:
     """Yield (line number, request) for each line of CSV or JSON that is not blank or a comment. Raises UsageError."""
     header: tuple[str, ...] = ()
     for at, line in enumerate(lines, 1):
@@ -54,7 +54,7 @@ def goal_messages(lines: Iterable[str], source: str) -> Iterator[tuple[int, dict
         yield at, _from_cells(cells, header or COLUMNS.get(len(cells), ()), place)
 
 
-def _value(key: str, text: str) -> Any:
+def _value(key: str, text: str) -> object:
     if text[0] in '["{':
         try:
             return json.loads(text, parse_constant=_refuse_constant)
@@ -65,7 +65,7 @@ def _value(key: str, text: str) -> Any:
     return _number(text, key) if _is_number(text) else text
 
 
-def _from_json(text: str, place: str) -> dict[str, Any]:
+def _from_json(text: str, place: str) -> Json:
     try:
         goal = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -83,12 +83,12 @@ def _header(cells: list[str], place: str) -> tuple[str, ...]:
     return names
 
 
-def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> dict[str, Any]:
+def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> Json:
     if len(cells) != len(names):
         raise UsageError(f"{place}: got {len(cells)} values, {f'wanted {len(names)}' if names else WANTED}")
     given_cells = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
     row = {name: _number(cell, f"{place}: {name}") for name, cell in given_cells.items() if name not in WORDS}
-    message: dict[str, Any] = {"verb": "goal"}
+    message: Json = {"verb": "goal"}
     for key, group in GROUPS.items():
         given = [name for name in group if name in row]
         if given and len(given) != len(group):

@@ -3,13 +3,14 @@
 import math
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
+
+from rtctl.plain import Json
 
 STATE_STYLE = {
     "RUN": "bold white on green",
@@ -26,12 +27,12 @@ FULL = 0.3  # [m]
 WIDTH = 96  # columns of a status that goes into a file or pipe
 
 
-def show(status: dict[str, Any]) -> None:
+def show(status: Json) -> None:
     """Print one status."""
     _console().print(render(status))
 
 
-def watch(ask: Callable[[], dict[str, Any]], period: float) -> None:
+def watch(ask: Callable[[], Json], period: float) -> None:
     """Keep showing what `ask` returns, each `period` [s]; on anything but a terminal one line a second."""
     console = _console()
     if not console.is_terminal:
@@ -44,7 +45,7 @@ def watch(ask: Callable[[], dict[str, Any]], period: float) -> None:
             live.update(render(ask()), refresh=True)
 
 
-def line(status: dict[str, Any]) -> str:
+def line(status: Json) -> str:
     """Return a status as one line."""
     clearances = [d for d in (status.get("clearance_m") or {}).values() if d is not None]
     nearest = f"clearance {_mm(min(clearances))}" if clearances else "no obstacle near"
@@ -62,7 +63,7 @@ def line(status: dict[str, Any]) -> str:
     return "  ".join(word for word in words if word)
 
 
-def render(status: dict[str, Any]) -> RenderableType:
+def render(status: Json) -> RenderableType:
     """Return a status as a panel."""
     state, name = str(status.get("state", "?")), str(status.get("status", "?"))
     head = Text.assemble(
@@ -88,7 +89,7 @@ def render(status: dict[str, Any]) -> RenderableType:
     return Panel(Group(*parts), title=title, title_align="left", padding=(0, 1))
 
 
-def _task(status: dict[str, Any]) -> Table:
+def _task(status: Json) -> Table:
     goal = status.get("goal_m")
     error = f"{_mm(status.get('error_m'))}, {_degrees(status.get('error_rad'))}" if goal is not None else "-"
     lateness = status.get("lateness_s")
@@ -114,7 +115,7 @@ def _task(status: dict[str, Any]) -> Table:
     return table
 
 
-def _vehicle(vehicle: dict[str, Any]) -> str:
+def _vehicle(vehicle: Json) -> str:
     """Return the autopilot's state: whose it is, and how fresh what it says."""
     words = ["armed" if vehicle.get("armed") else "disarmed", "ours" if vehicle.get("ours") else "not ours to command"]
     words += [] if vehicle.get("healthy") else ["position not usable"]
@@ -139,7 +140,7 @@ def _clearances(clearances: dict[str, float | None], scale: float = 1.0) -> Tabl
     return table
 
 
-def _log(log: Any) -> str:
+def _log(log: object) -> str:
     return "  ".join(f"{key} {value}" for key, value in log.items()) if isinstance(log, dict) else str(log)
 
 

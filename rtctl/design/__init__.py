@@ -4,10 +4,11 @@
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
+from rtctl.plain import Json
 from rtctl.spec.base import BaseConfig, is_base
 from rtctl.spec.base import load as load_base
 from rtctl.spec.read import read
@@ -69,7 +70,7 @@ def check_base(path: str | Path) -> "Report":
     return told(config, derived(config, path))
 
 
-def json_schema(kind: type = Config) -> dict[str, Any]:
+def json_schema(kind: type = Config) -> Json:
     """Return the JSON Schema of a config file, from the same structs that check it: an arm's, or `BaseConfig`."""
     schema = msgspec.json.schema(kind)
     named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rtctl robot config", **schema}

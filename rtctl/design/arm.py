@@ -1,12 +1,12 @@
 """A checked config into the derived `Robot`: URDF, field gains, zones, noises; conversion to SI happens here alone."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.arm.encoders import SHARE
-from rtctl.arm.estimator import JointParams
+from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
 from rtctl.arm.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
 from rtctl.arm.law import prepared
@@ -97,7 +97,7 @@ def build(config: Config, path: str | Path) -> Robot:
             config, config.avoid.self_influence_m, config.avoid.self_clearance_m, 1.0 / config.motion.singular_1_kg
         ),
         limit=_limit(config),
-        **_filters(config, body, home),
+        **_filters(config, body, home)._asdict(),
         carry=config.estimator.carry,
         safety=_safety(config, tau_rated),
         stop=StopParams(
@@ -280,7 +280,16 @@ def _limit(c: Config) -> LimitParams:
     return limit_params(speed, zone, clearance, dt, c.avoid.damping_ratio)
 
 
-def _filters(c: Config, body: RigidBody, home: F64) -> dict[str, Any]:
+class Filters(NamedTuple):
+    """The filters of a `Robot`, named as its fields."""
+
+    estimator: EstimatorParams
+    tip_design: Design
+    joint_filter: JointParams
+    joint_P: F64  # (n, 2, 2)
+
+
+def _filters(c: Config, body: RigidBody, home: F64) -> Filters:
     """Return the filters' noises and steady states: quantisation of the drives, seen at the tip through J at home."""
     e, n, dt = c.estimator, body.n, 1.0 / c.loop.servo_hz
     scales = rules.scales(c)
@@ -298,12 +307,8 @@ def _filters(c: Config, body: RigidBody, home: F64) -> dict[str, Any]:
     J = body.evaluate(home, np.zeros(n), _no_points()).J
     tip = tip_params(J, joint_P, e.acceleration_m_s2, e.acceleration_rad_s2)
     ratio = max(1, round(c.loop.servo_hz / c.loop.model_hz))
-    return {
-        "estimator": tip,
-        "tip_design": design(tip, dt, ratio, 0.0),  # joints are predicted to now, so a pose has no age
-        "joint_filter": joint_filter,
-        "joint_P": joint_P,
-    }
+    # joints are predicted to now, so a pose has no age
+    return Filters(tip, design(tip, dt, ratio, 0.0), joint_filter, joint_P)
 
 
 def _safety(c: Config, tau_rated: F64) -> SafetyParams:

@@ -5,16 +5,18 @@ All of it happens when a file is loaded or before a message is sent, never in th
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of
+from rtctl.spec.base import BaseConfig
 from rtctl.spec.files import read_cloud, read_mesh
 from rtctl.spec.obstacles import Cloud, Mesh, Obstacle, mesh_key
 from rtctl.spec.read import name_place
-from rtctl.types import F64, Shape
+from rtctl.spec.robot import Config, MeshTable
+from rtctl.types import F64, I64, Shape
 from rtctl.world import meshes as solids
 from rtctl.world.meshes import Meshes, added, mesh_body
 from rtctl.world.primitives import CLOUD_POINTS, STEP_MAX, STEP_MIN
@@ -25,7 +27,7 @@ PLACE_MAX, SPAN_MAX, SPAN_MIN = 9000.0, 100.0, 1e-4  # [m] as of places and of t
 COARSER = 1.25  # factor on the voxels of a cloud that has still too many points
 
 
-def files_named(config: Any) -> tuple[str, ...]:
+def files_named(config: Config | BaseConfig) -> tuple[str, ...]:
     """Return the files that a config's meshes and obstacles name, an arm's or a base's."""
     named = [getattr(each, "file", None) for each in (*getattr(config, "mesh", ()), *config.obstacle)]
     return tuple(sorted({str(name) for name in named if name}))
@@ -91,7 +93,7 @@ def packed(points: F64, radius: float, voxel: float = 0.0) -> Packed:
     return Packed(steps[order].astype("<i2").tobytes(), step, centre, radius + moved)
 
 
-def _thinned(points: F64, voxel: float) -> tuple[F64, Any]:
+def _thinned(points: F64, voxel: float) -> tuple[F64, I64]:
     """Return the points that stand for all, one for each cube, and for each point the index of its own."""
     if voxel == 0.0:
         return points, np.arange(len(points))
@@ -137,7 +139,7 @@ def load_cloud(path: Path, radius: float, voxel: float, place: str) -> Packed:
 
 
 def load_assets(
-    tables: Iterable[Any], obstacles: Iterable[Obstacle], source: Path, known: Meshes = solids.NONE
+    tables: Iterable[MeshTable], obstacles: Iterable[Obstacle], source: Path, known: Meshes = solids.NONE
 ) -> Assets:
     """Return the files of [[mesh]] tables and of obstacles, found beside `source`; `known` meshes come first.
 

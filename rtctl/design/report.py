@@ -1,12 +1,13 @@
 """What `rtctl check` tells of a robot: figures derived from its config, each with a verdict."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.arm.robot import Robot
 from rtctl.control.firas import FieldParams
 from rtctl.design.arm import Extremes, extremes
+from rtctl.plain import Json
 from rtctl.spec import rules
 from rtctl.spec.bus import LOAD_MAX
 from rtctl.spec.robot import Config
@@ -36,7 +37,7 @@ class Report(NamedTuple):
         """Number of rows with a warning."""
         return sum(row.verdict == WARN for row in self.rows)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Return the report for --json."""
         return {"robot": self.robot, "warnings": self.warnings, "rows": [row._asdict() for row in self.rows]}
 

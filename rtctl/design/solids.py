@@ -5,7 +5,7 @@ polyhedron that contains it, a little larger: 1.7 % for a sphere.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -54,7 +54,7 @@ def solids_of(body: RigidBody) -> list[Solid]:
     return solids
 
 
-def _corners(shape: Any, name: str) -> F64:
+def _corners(shape: coal.CollisionGeometry, name: str) -> F64:
     """Return the corners of a polyhedron that contains a collision shape (itself, for a flat-faced one)."""
     if isinstance(shape, coal.BVHModelBase):
         return np.array(shape.vertices(), dtype=np.float64)

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from rtctl.errors import UsageError
+from rtctl.plain import Json
 
 NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "minimum", "rates", "bounce")
 DIGITS = 9  # of a number in a JSON file
@@ -24,7 +24,7 @@ def module_of(name: str) -> ModuleType:
     return import_module(f"rtctl.experiment.{name}")
 
 
-def perform(name: str, folder: Path, say: Callable[[float], None]) -> dict[str, Any]:
+def perform(name: str, folder: Path, say: Callable[[float], None]) -> Json:
     """Play an experiment, write NAME.png, NAME.svg and NAME.json into a folder, and return its figures.
 
     `say` is told the part (0 to 1) that is done. The same sources give the same numbers.
@@ -33,7 +33,7 @@ def perform(name: str, folder: Path, say: Callable[[float], None]) -> dict[str, 
 
     module = module_of(name)
     data = module.run(say)
-    figures: dict[str, Any] = rounded(module.figures(data))
+    figures = rounded(module.figures(data))
     with styled():
         saved(module.draw(data), folder, name)
     text = json.dumps({"experiment": name, "title": module.TITLE, **figures}, indent=2, allow_nan=False)
@@ -45,12 +45,16 @@ def perform(name: str, folder: Path, say: Callable[[float], None]) -> dict[str, 
     return figures
 
 
-def rounded(value: Any) -> Any:
+def rounded(figures: Json) -> Json:
     """Return numbers to nine digits, those that are not finite as None; lists and dicts likewise."""
+    return {name: _rounded(value) for name, value in figures.items()}
+
+
+def _rounded(value: object) -> object:
     if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
+        return rounded(value)
     if isinstance(value, list | tuple):
-        return [rounded(v) for v in value]
+        return [_rounded(v) for v in value]
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if abs(value) < float("inf") else None
     return value

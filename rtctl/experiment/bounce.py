@@ -1,14 +1,16 @@
 """Sampling pumps energy: a unit mass that bounces off the FIRAS field, over servo rates, against the analytic value."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.control.firas import FieldParams, eta_of, field_params, firas
 from rtctl.experiment.mass import turning_distance
 from rtctl.experiment.scene import Say, unsaid
-from rtctl.experiment.style import BLUE, GREEN, INK, ORANGE, RED, SKY, Axes, level, note, page
+from rtctl.experiment.style import BLUE, GREEN, INK, ORANGE, RED, SKY, level, note, page
+from rtctl.plain import Json
 from rtctl.types import F64
 
 TITLE = "Energy of a sampled bounce"
@@ -114,7 +116,7 @@ def _left(params: FieldParams, dt: float, speed: float, phase: float) -> float:
     return float(bounce(params, dt, speed, phase).v[-1]) / speed
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     bounds = [bound(V_MAX, 1.0 / r) for r in data.rates]
     return {
@@ -155,8 +157,8 @@ def _orbits(axes: Axes, data: Data) -> None:
         label="continuous",
     )
     for (rate, orbit), colour in zip(data.orbits.items(), (BLUE, ORANGE, RED), strict=False):
-        marks = {"marker": "o", "ms": 4.5} if rate < 300.0 else {}
-        axes.plot(1e3 * orbit.rho, orbit.v, color=colour, lw=2.0, label=f"{rate:.0f} Hz", **marks)
+        marker = "o" if rate < 300.0 else "None"
+        axes.plot(1e3 * orbit.rho, orbit.v, color=colour, lw=2.0, label=f"{rate:.0f} Hz", marker=marker, ms=4.5)
     axes.axvspan(0.0, 1e3 * CLEARANCE, color=RED, alpha=0.10, lw=0)
     note(axes, 10, 1.22, "clear-\nance", RED, ha="center", va="top")
     axes.axvline(1e3 * INFLUENCE, color=SKY, lw=1.5, ls=(0, (5, 3)))

@@ -3,11 +3,12 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from rtctl.experiment.outline import Figurine, Projection, outline
 from rtctl.experiment.scene import Trace
-from rtctl.experiment.style import FAINT, INK, PAPER, PLINTH, STONE, Axes, shade, thinned
+from rtctl.experiment.style import FAINT, INK, PAPER, PLINTH, STONE, shade, thinned
 from rtctl.types import F64, I64, Shape
 
 REACH = 4.0  # [m] to which a half space is drawn

@@ -1,14 +1,16 @@
 """The redundant planar arm of four joints in an enclosure: every link avoids walls and obstacles (Khatib 1986)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, axis_view
 from rtctl.experiment.scene import Say, Trace, unsaid
-from rtctl.experiment.style import BLUE, FRONT, INK, ORANGE, PAPER, RED, Axes, level, note, page, thinned
+from rtctl.experiment.style import BLUE, FRONT, INK, ORANGE, PAPER, RED, level, note, page, thinned
 from rtctl.experiment.tour import arrivals, leg, numbers, tour
+from rtctl.plain import Json
 
 TITLE = "A planar arm of four joints in an enclosure"
 CAPTION = "whole-arm avoidance among walls and pillars, as stroboscopic frames, and the clearance of every moment"
@@ -19,11 +21,11 @@ EVERY = 3.4  # [s] a goal
 FRAMES = 7
 
 
-def _pillar(name: str, x: float, y: float, radius: float) -> dict[str, Any]:
+def _pillar(name: str, x: float, y: float, radius: float) -> Json:
     return {"name": name, "type": "cylinder", "radius_m": radius, "length_m": 0.4, "position_m": [x, y, 0.0]}
 
 
-def _wall(name: str, x: float, y: float, normal: tuple[float, float]) -> dict[str, Any]:
+def _wall(name: str, x: float, y: float, normal: tuple[float, float]) -> Json:
     return {"name": name, "type": "plane", "position_m": [x, y, 0.0], "normal": [*normal, 0.0]}
 
 
@@ -50,7 +52,7 @@ def run(say: Say = unsaid, goals: tuple[tuple[float, float], ...] = GOALS) -> Da
     return Data(tour("planar4", [(*g, 0.0) for g in goals], EVERY, OBSTACLES, say), goals)
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     return numbers(data.trace)
 

@@ -1,14 +1,16 @@
 """Joint limits: the hand is asked to turn in place further than joint 7 can; it slows, stops short, and says why."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_strobes, framed, strobes
 from rtctl.experiment.outline import Figurine, axis_view
 from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import FAINT, FRONT, INK, ORANGE, PAPER, RED, SERIES, Axes, page, thinned
+from rtctl.experiment.style import FAINT, FRONT, INK, ORANGE, PAPER, RED, SERIES, page, thinned
+from rtctl.plain import Json
 
 TITLE = "Joint-limit avoidance"
 CAPTION = "the hand turns in place: to the edge of joint 7's zone, then beyond its limit, which it never reaches"
@@ -51,7 +53,7 @@ def diagnoses(data: Data) -> list[tuple[str, str]]:
     return [next(((n, d) for t, n, d in reversed(told) if end - EVERY <= t < end), ("moving", "")) for end in ends]
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     trace, f = data.trace, data.trace.figures
     robot = trace.robot

@@ -1,12 +1,14 @@
 """Straight lines under a speed limit: a Panda through the whole pipe, from goal to goal in free space (eq. 8)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import INK, RED, SERIES, Axes, level, note, page, thinned
+from rtctl.experiment.style import INK, RED, SERIES, level, note, page, thinned
+from rtctl.plain import Json
 from rtctl.types import F64
 
 TITLE = "Straight lines under a speed limit"
@@ -92,7 +94,7 @@ def analytic(leg: Leg, omega: float) -> tuple[F64, F64]:
     return t, (e0 + (slope + omega * e0) * s) * np.exp(-omega * s)
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     rates = [decay(leg, data.omega) for leg in data.legs]
     return {

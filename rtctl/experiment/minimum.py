@@ -1,15 +1,17 @@
 """Where the field alone stays: a wall that is escaped over its edge, a bucket that only a planner leads out of."""
 
 import tomllib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, Projection, axis_view
 from rtctl.experiment.scene import CONFIGS, Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import BLUE, FRONT, INK, RED, Axes, note, page, thinned
+from rtctl.experiment.style import BLUE, FRONT, INK, RED, note, page, thinned
+from rtctl.plain import Json
 from rtctl.types import F64
 
 TITLE = "Local minimum, escape and plan"
@@ -42,7 +44,7 @@ def run(say: Say = unsaid, seconds: tuple[float, float, float, float] = (8.0, 8.
     panda = config_file("panda")
     wall = {"start_q_rad": BESIDE, "goal": [{"at_s": AT, "position_m": GOAL}], "obstacle": [WALL]}
     trap = tomllib.loads((CONFIGS / "scenarios" / "trap.toml").read_text(encoding="utf-8"))
-    told: list[dict[str, Any]] = [wall, wall, {**trap, "planner": False}, {**trap, "planner": True}]
+    told: list[Json] = [wall, wall, {**trap, "planner": False}, {**trap, "planner": True}]
 
     def part(k: int) -> Trace:
         scenario = {**told[k], "duration_s": seconds[k]}
@@ -52,14 +54,14 @@ def run(say: Say = unsaid, seconds: tuple[float, float, float, float] = (8.0, 8.
     return Data(Case(part(0), part(1), np.array(GOAL)), Case(part(2), part(3), under))
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     cases = {"wall": data.wall.alone, "escape": data.wall.helped, "trap": data.trap.alone, "plan": data.trap.helped}
     goals = {"wall": data.wall.goal, "escape": data.wall.goal, "trap": data.trap.goal, "plan": data.trap.goal}
     return {name: _numbers(trace, goals[name]) for name, trace in cases.items()}
 
 
-def _numbers(trace: Trace, goal: F64) -> dict[str, Any]:
+def _numbers(trace: Trace, goal: F64) -> Json:
     f = trace.figures
     _, status, detail = f["statuses"][-1]
     return {

@@ -1,14 +1,16 @@
 """A ball passes through the place where the arm holds its tip: it yields, keeps clear, and comes back."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_way, framed
 from rtctl.experiment.outline import Figurine, view
 from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import BLUE, FAINT, FRONT, INK, ORANGE, RED, SKY, Axes, level, page, thinned
+from rtctl.experiment.style import BLUE, FAINT, FRONT, INK, ORANGE, RED, SKY, level, page, thinned
+from rtctl.plain import Json
 from rtctl.types import F64
 
 TITLE = "A moving obstacle passes"
@@ -50,7 +52,7 @@ def run(say: Say = unsaid, speed: float = SPEED) -> Data:
     return Data(trace, yielded + np.array([-2.0, -0.6, 0.0, 0.9]), gone)
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     trace, f = data.trace, data.trace.figures
     error = np.linalg.norm(trace.tip - HOLD, axis=1)

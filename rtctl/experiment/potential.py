@@ -1,8 +1,9 @@
 """A point mass in the FIRAS field of an ellipsoid, a cylinder and a cone: equipotentials and paths (Khatib 1986)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -12,8 +13,9 @@ from rtctl.control.firas import FieldParams, field_params
 from rtctl.experiment.mass import Flight, Mass, motion_params, obstacles_of, potential, turning_distance
 from rtctl.experiment.outline import axis_view, outline
 from rtctl.experiment.scene import Say, unsaid
-from rtctl.experiment.style import BLUE, GREEN, INK, ORANGE, PAPER, RED, STONE, Axes, note, page
+from rtctl.experiment.style import BLUE, GREEN, INK, ORANGE, PAPER, RED, STONE, note, page
 from rtctl.kernel.rotations import R_of
+from rtctl.plain import Json
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import distance
 
@@ -92,7 +94,7 @@ def _drift(flight: Flight, params: FieldParams) -> float:
     return float(np.abs(E - E[0]).max() / E[0])
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     turning = np.array([turning_distance(float(v), data.params) for v in data.speeds])
     return {

@@ -1,15 +1,17 @@
 """The paper's robot, a PUMA 560, reaches around obstacles: two views, stroboscopic (Khatib 1986)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rtctl.experiment.drawing import draw_arm, draw_shapes, draw_strobes, draw_way, framed, strobes
 from rtctl.experiment.outline import Figurine, Projection, axis_view, view
 from rtctl.experiment.scene import Say, Trace, unsaid
-from rtctl.experiment.style import BLUE, FAINT, FRONT, GREEN, INK, ORANGE, PAPER, RED, Axes, level, page, thinned
+from rtctl.experiment.style import BLUE, FAINT, FRONT, GREEN, INK, ORANGE, PAPER, RED, level, page, thinned
 from rtctl.experiment.tour import arrivals, leg, numbers, tour
+from rtctl.plain import Json
 
 TITLE = "A PUMA 560 reaches around obstacles"
 CAPTION = "the paper's robot among a post, a ball and a crate: from the side, from above, and its clearances"
@@ -20,7 +22,7 @@ FRAMES = 6
 OBLIQUE = view(np.radians(-14.0), np.radians(26.0))
 ABOVE = axis_view(0, 1)
 
-OBSTACLES: tuple[dict[str, Any], ...] = (
+OBSTACLES: tuple[Json, ...] = (
     {"name": "floor", "type": "plane", "position_m": [0.0, 0.0, 0.0]},
     {"name": "ball", "type": "sphere", "radius_m": 0.13, "position_m": [0.62, 0.02, 0.66]},
     {"name": "post", "type": "capsule", "radius_m": 0.05, "length_m": 0.95, "position_m": [0.42, -0.74, 0.475]},
@@ -40,7 +42,7 @@ def run(say: Say = unsaid, goals: tuple[tuple[float, float, float], ...] = GOALS
     return Data(tour("puma560", goals, EVERY, OBSTACLES, say, START), goals)
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure."""
     return numbers(data.trace)
 

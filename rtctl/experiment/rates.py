@@ -1,14 +1,17 @@
 """What the two levels buy: tracking and clearance over servo and model rates, with and without the estimator (§4)."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from rtctl.experiment.scene import Say, Trace, config_file, played, unsaid
-from rtctl.experiment.style import BLUE, FAINT, INK, ORANGE, RED, Axes, note, page
+from rtctl.experiment.style import BLUE, FAINT, INK, ORANGE, RED, note, page
+from rtctl.plain import Json
 
 TITLE = "What the two levels buy"
 CAPTION = "tracking error and clearance over servo and model rates, the paper's 225/100 Hz included"
@@ -110,7 +113,7 @@ def _rough(trace: Trace) -> float:
     return float(np.sqrt((step**2).sum(axis=1).mean()))
 
 
-def figures(data: Data) -> dict[str, Any]:
+def figures(data: Data) -> Json:
     """Return the numbers of the figure: a row a run."""
     return {
         "runs": [
@@ -163,13 +166,13 @@ def draw(data: Data) -> Figure:
     return figure
 
 
-def _column(axes: Axes, data: Data, value: Any, scale: str) -> None:
+def _column(axes: Axes, data: Data, value: Callable[[Run], float], scale: str) -> None:
     pairs = list(dict.fromkeys((r.servo, r.model) for r in data.runs))
     for carry in (True, False):
         runs = [r for r in data.runs if r.carry == carry]
         y = [pairs.index((r.servo, r.model)) for r in runs]
         x = [value(r) for r in runs]
-        style = {"mfc": BLUE, "mec": BLUE} if carry else {"mfc": "none", "mec": ORANGE}
+        fill, edge = (BLUE, BLUE) if carry else ("none", ORANGE)
         axes.plot(
             x,
             y,
@@ -179,7 +182,8 @@ def _column(axes: Axes, data: Data, value: Any, scale: str) -> None:
             clip_on=False,
             zorder=5 if carry else 6,
             label="with the estimator" if carry else "held still in between",
-            **style,
+            mfc=fill,
+            mec=edge,
         )
         for r, a, b in zip(runs, x, y, strict=True):
             if not r.arrived or r.faults:

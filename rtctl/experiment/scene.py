@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from rtctl.app.arm_scene import ArmTurn
 from rtctl.app.sim import simulate
 from rtctl.arm.robot import Robot
 from rtctl.errors import ConfigError
+from rtctl.plain import Json
 from rtctl.spec.obstacles import shape_of
 from rtctl.spec.read import convert
 from rtctl.spec.scenario import Scenario
@@ -51,7 +52,7 @@ class Trace(NamedTuple):
     status: I64  # (T,) types.Status
     tau_limits: F64  # (T, n) [Nm]
     tau: F64  # (T, n) [Nm] sent
-    figures: dict[str, Any]  # of `rtctl.app.sim.simulate`
+    figures: Json  # of `rtctl.app.sim.simulate`
 
     def least(self) -> F64:
         """Return the clearance (T,) [m] to the nearest obstacle, by pybullet."""
@@ -103,7 +104,7 @@ def toml(value: object) -> str:
 
 
 def played(
-    scenario: dict[str, Any],
+    scenario: Json,
     config: Path,
     say: Say = unsaid,
     changes: dict[str, dict[str, object]] | None = None,
@@ -113,7 +114,7 @@ def played(
     changes: keys of the config's tables to be replaced.
     """
     told: Scenario = convert({**scenario, "robot": str(config)}, Scenario, "experiment")
-    rows: list[tuple[Any, ...]] = []
+    rows: list[tuple[object, ...]] = []
     clearance: dict[str, list[float]] = {}
     robots: list[Robot] = []
 

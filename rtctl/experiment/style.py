@@ -8,24 +8,22 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
 from rtctl.types import F64
 
-ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE = (
-    "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-INK, FAINT, PAPER, STONE, PLINTH, FRONT = (
-    "#222222", "#8C8C8C", "#FFFFFF", "#B9B2A6", "#E4E1DC", "#004475",
-)  # fmt: skip
+ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
+BLUE, RED, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+INK, FAINT, PAPER = "#222222", "#8C8C8C", "#FFFFFF"
+STONE, PLINTH, FRONT = "#B9B2A6", "#E4E1DC", "#004475"
 SERIES = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, INK)
 WIDTH, HEIGHT, DPI = 11.0, 6.6, 100  # [in], [in], [1/in]
 LIGHT, DARK = np.array([0.80, 0.88, 0.95]), np.array([0.0, 0.27, 0.46])
 COLOURS = 200  # of a PNG
 CURVE = 1200  # points of a curve: more than a page shows
-Axes = Any
 
 RC: Any = {
     "font.family": "DejaVu Sans",

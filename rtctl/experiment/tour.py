@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+
+from matplotlib.axes import Axes
 
 from rtctl.experiment.scene import Say, Trace, config_file, played
-from rtctl.experiment.style import FAINT, INK, ORANGE, Axes
+from rtctl.experiment.style import FAINT, INK, ORANGE
+from rtctl.plain import Json
 from rtctl.types import Status
 
 FIRST = 0.5  # [s] the first goal is given
@@ -26,7 +28,7 @@ def tour(
     config: str,
     goals: Sequence[Sequence[float]],
     every: float,
-    obstacles: Sequence[dict[str, Any]],
+    obstacles: Sequence[Json],
     say: Say,
     start: Sequence[float] | None = None,
 ) -> Trace:
@@ -40,7 +42,7 @@ def tour(
     return played(scenario, config_file(config), say)
 
 
-def numbers(trace: Trace) -> dict[str, Any]:
+def numbers(trace: Trace) -> Json:
     """Return the numbers of the tour's figure: lists with a value a goal, and what holds for the whole run."""
     f = trace.figures
     return {**{k: [g[k] for g in f["goals"]] for k in OF_GOAL}, **{k: f[k] for k in OF_RUN}}

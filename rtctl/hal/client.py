@@ -8,9 +8,10 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from rtctl.errors import LinkError, RequestError, UsageError
+from rtctl.plain import Json
 from rtctl.trust import folder_owner, peer, trusted_users, user_name
 
 MESSAGE_MAX = 64 * 1024  # bytes, both ways
@@ -86,7 +87,7 @@ class Session:
         self.path, self.timeout = path, timeout
         self._socket = _connect(path, timeout)
 
-    def ask(self, message: dict[str, Any]) -> dict[str, Any]:
+    def ask(self, message: Json) -> Json:
         """Return the daemon's reply. Raises LinkError when none comes, RequestError when `message` is too large."""
         try:
             timed = {"by_s": time.monotonic() + self.timeout, **message} if "verb" in message else message
@@ -95,7 +96,7 @@ class Session:
             raise RequestError(f"not a request: {error}") from None
         return self.ask_raw(data)
 
-    def ask_raw(self, data: bytes) -> dict[str, Any]:
+    def ask_raw(self, data: bytes) -> Json:
         """Return the daemon's reply to a message that is bytes already, as a cloud's is; raises as `ask`."""
         if len(data) > MESSAGE_MAX:
             raise RequestError(f"a request of {len(data)} bytes, at most {MESSAGE_MAX} are taken")
@@ -136,18 +137,18 @@ class Session:
         self.close()
 
 
-def ask(path: str, message: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
+def ask(path: str, message: Json, timeout: float = 2.0) -> Json:
     """Return the reply of the daemon at `path` to one `message`. Raises LinkError."""
     with Session(path, timeout) as session:
         return session.ask(message)
 
 
-def demand(path: str, message: dict[str, Any], timeout: float = 2.0) -> dict[str, Any]:
+def demand(path: str, message: Json, timeout: float = 2.0) -> Json:
     """Return the reply to `message` if the daemon did it. Raises RequestError with the daemon's reason, LinkError."""
     return accepted(ask(path, message, timeout))
 
 
-def accepted(reply: dict[str, Any]) -> dict[str, Any]:
+def accepted(reply: Json) -> Json:
     """Return `reply` if it says yes. Raises RequestError with the daemon's reason."""
     if reply.get("ok") is not True:
         raise RequestError(f"refused: {reply.get('error', 'without a reason')}")

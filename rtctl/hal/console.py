@@ -15,17 +15,19 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
 from rtctl import trust
 from rtctl.errors import ConfigError, RequestError, RtctlError
 from rtctl.hal import messages
 from rtctl.hal.client import MESSAGE_MAX, answers
 from rtctl.hal.messages import Bounds, Notice
+from rtctl.plain import Json
 from rtctl.trust import TrustError
-from rtctl.types import ObstacleEdit, Request
+from rtctl.types import Array, ObstacleEdit, Request
 
 PEERS_MAX = 8
 EDITS_PER_SLOT = 4  # obstacle edits handed to one tick; a longer camera frame is spread over several
@@ -35,7 +37,7 @@ IDLE = 1.0  # [s] of silence after which a peer must make room for a new one
 STATUS_AGE = 0.02  # [s] for which one snapshot answers every status query
 NOTHING = Request()
 
-StatusFn = Callable[[], dict[str, Any]]
+StatusFn = Callable[[], Json]
 PlaceFn = Callable[[ObstacleEdit], str]  # why an obstacle cannot be where a person says, '' where it can
 
 
@@ -245,7 +247,7 @@ class Console:
             return
         peer, self._asker = self._asker, None
         self._snapshot_slot = -1  # whoever asks next sees the consequence, not the time before it
-        reply: dict[str, Any] = {"ok": ok, "slot": self._slot}
+        reply: Json = {"ok": ok, "slot": self._slot}
         if text:
             reply["text" if ok else "error"] = text
         elif not ok:
@@ -272,7 +274,7 @@ class Console:
             raise RequestError("goal.hold: the tip's orientation is not known yet")
         return wxyz
 
-    def _reply(self, peer: _Peer, reply: dict[str, Any]) -> None:
+    def _reply(self, peer: _Peer, reply: Json) -> None:
         self._reply_raw(peer, msgspec.json.encode(reply))
 
     def _reply_raw(self, peer: _Peer, data: bytes) -> None:
@@ -283,7 +285,7 @@ class Console:
             self._drop(peer, "slow_reader" if error.errno == errno.EAGAIN else "")
 
     @staticmethod
-    def _send(link: socket.socket, reply: dict[str, Any]) -> None:
+    def _send(link: socket.socket, reply: Json) -> None:
         with suppress(OSError):
             link.send(msgspec.json.encode(reply))
 
@@ -320,6 +322,6 @@ def _check_folder(path: str) -> None:
         raise ConfigError(label, str(error), "a folder of this user or root that others cannot write to") from None
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Array | np.generic) -> object:
     """Return an array or numpy scalar as JSON has it."""
     return value.tolist()

@@ -7,9 +7,10 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtctl.errors import EXIT_FAILED, EXIT_OK
+from rtctl.plain import Json
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 PRIORITY = 80  # that loop.priority asks for by default
@@ -68,7 +69,7 @@ def exit_code(rows: list[Row]) -> int:
     return EXIT_FAILED if any(row.verdict == FAIL for row in rows) else EXIT_OK
 
 
-def as_dict(rows: list[Row]) -> dict[str, Any]:
+def as_dict(rows: list[Row]) -> Json:
     """Return the findings for --json."""
     return {"ok": exit_code(rows) == EXIT_OK, "findings": [row._asdict() for row in rows]}
 

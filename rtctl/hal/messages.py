@@ -8,7 +8,7 @@ six bytes for each point, x, y, z in whole steps as int16. 10,000 points are 60 
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from msgspec import Meta, Struct
 
 from rtctl.arm.task import point_of, within
 from rtctl.errors import RequestError
+from rtctl.plain import Json
 from rtctl.spec.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.spec.obstacles import Cloud, Mesh, Name, Obstacle, Orientation, Place, RollPitchYaw, contradiction, shape_of
 from rtctl.spec.robot import Angles
@@ -147,7 +148,7 @@ class Bounds(NamedTuple):
     local: Callable[[float, float], tuple[float, float] | None] | None = None  # a place [deg] in [m]; None: an arm
 
 
-def cloud_message(header: dict[str, Any], steps: bytes) -> bytes:
+def cloud_message(header: Json, steps: bytes) -> bytes:
     """Return the binary message of a cloud; what a camera's driver sends."""
     text = msgspec.json.encode({"verb": "cloud", **header})
     return CLOUD_MARK + _LENGTH.pack(len(text)) + text + steps

@@ -107,14 +107,14 @@ def _path(tops: _Tops, module: str) -> Path | None:
 class _Locator:
     """Tells numba where the kernels of a function lie."""
 
-    def __init__(self, function: Callable[..., Any], file: str) -> None:
+    def __init__(self, function: Callable[..., object], file: str) -> None:
         self.stamp = stamp(function.__module__, file)
         self.line = str(function.__code__.co_firstlineno)
         self.home = folder() / function.__module__
         self.path = self.home / self.stamp[:16]
 
     @classmethod
-    def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
+    def from_function(cls, function: Callable[..., object], file: str) -> "_Locator":
         return cls(function, file)
 
     def get_cache_path(self) -> str:
@@ -156,9 +156,9 @@ class KernelCache(FunctionCache):
     _impl_class = _Content
     _lock = -1  # descriptor, while this process compiles the function
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: object, target_context: object) -> object:
         """Return what was compiled for a signature; None, with the function locked, where nobody did."""
-        load: Any = super().load_overload
+        load: Callable[[object, object], object] = super().load_overload
         found = load(sig, target_context)
         if found is None and self._enabled:
             self._take()
@@ -167,9 +167,9 @@ class KernelCache(FunctionCache):
             self._release()
         return found
 
-    def save_overload(self, sig: Any, data: Any) -> None:
+    def save_overload(self, sig: object, data: object) -> None:
         """Save what was compiled, and let the others have it."""
-        save: Any = super().save_overload
+        save: Callable[[object, object], None] = super().save_overload
         try:
             save(sig, data)
         finally:
@@ -177,7 +177,7 @@ class KernelCache(FunctionCache):
 
     def _take(self) -> None:
         if self._lock < 0:
-            locator: Any = self._impl.locator
+            locator: _Locator = self._impl.locator
             locator.ensure_cache_path()
             path = locator.path / f"{self._impl.filename_base}.lock"
             self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
@@ -194,7 +194,7 @@ class KernelCache(FunctionCache):
             self._lock = -1
 
 
-def install(dispatcher: Any, function: Callable[..., Any]) -> None:
+def install(dispatcher: Any, function: Callable[..., object]) -> None:
     """Give a compiled function this cache, as njit(cache=True) gives it numba's. Raises LookupError, see `stamp`."""
-    cache_of: Any = KernelCache
+    cache_of: Callable[[Callable[..., object]], KernelCache] = KernelCache
     dispatcher._cache = cache_of(function)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -89,7 +89,7 @@ def make_header(
     )
 
 
-def scene_text(points: list[list[float]], obstacles: Sequence[Shape], **more: Any) -> str:
+def scene_text(points: list[list[float]], obstacles: Sequence[Shape], **more: object) -> str:
     """Return the text of SCENE_FILE.
 
     points: an arm's (link, x, y, z, radius) [m] in their links' frames, or a base's (x, y, radius).
@@ -139,7 +139,7 @@ def revision() -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
-def dtype_to_json(dtype: np.dtype[Any]) -> str:
+def dtype_to_json(dtype: np.dtype[np.void]) -> str:
     """Return a record dtype as JSON text: [[name, format] or [name, format, shape], ...]."""
     return json.dumps(dtype.descr)
 
@@ -171,7 +171,7 @@ def _to_text(content: str | bytes) -> str | list[str]:
     return content if isinstance(content, str) else [b64encode(content).decode()]
 
 
-def _from_text(value: Any) -> str | bytes:
+def _from_text(value: object) -> str | bytes:
     return b64decode(value[0]) if isinstance(value, list) else str(value)
 
 

@@ -5,18 +5,19 @@ be an array again. What a schema leaves out is allowed and comes as it was writt
 """
 
 import json
-from typing import Any
+
+from rtctl.plain import Json
 
 
-def _is(kind: str, description: str = "", **more: Any) -> dict[str, Any]:
+def _is(kind: str, description: str = "", **more: object) -> Json:
     return {"type": kind, **more} | ({"description": description} if description else {})
 
 
-def _list(items: dict[str, Any], description: str = "") -> dict[str, Any]:
+def _list(items: Json, description: str = "") -> Json:
     return _is("array", description, items=items)
 
 
-def _object(description: str = "", **properties: dict[str, Any]) -> dict[str, Any]:
+def _object(description: str = "", **properties: Json) -> Json:
     return _is("object", description, properties=properties)
 
 

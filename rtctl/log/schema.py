@@ -5,16 +5,19 @@ a thousand messages is then one copy of the template and one numpy assignment pe
 """
 
 import struct
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor import Descriptor, FileDescriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 
 from rtctl.log.header import Header
 from rtctl.log.json_schema import json_schema
+from rtctl.types import I64, U8
 
 TICK = "/tick"
 JOINT_STATES = "/joint_states"
@@ -62,9 +65,9 @@ uint32 nanosec
 class Layout(NamedTuple):
     """Messages of one constant size."""
 
-    template: np.ndarray[Any, np.dtype[np.uint8]]  # (size,) a message whose values are zero
+    template: U8  # (size,) a message whose values are zero
     wire: np.dtype[np.void]  # the values, at their offsets in the message
-    tags: np.ndarray[Any, np.dtype[np.int64]]  # offsets of the bytes that are not values
+    tags: I64  # offsets of the bytes that are not values
 
 
 class Channel(NamedTuple):
@@ -93,13 +96,13 @@ class _Builder:
     def __init__(self) -> None:
         self.bytes = bytearray()
         self.names: list[str] = []
-        self.formats: list[Any] = []
+        self.formats: list[npt.DTypeLike] = []
         self.offsets: list[int] = []
 
     def literal(self, data: bytes) -> None:
         self.bytes += data
 
-    def value(self, name: str, format: Any) -> None:
+    def value(self, name: str, format: npt.DTypeLike) -> None:
         self.names.append(name)
         self.formats.append(format)
         self.offsets.append(len(self.bytes))
@@ -149,7 +152,7 @@ def tick_descriptor(dtype: np.dtype[np.void]) -> bytes:
     return _file("rtctl/tick.proto", message)
 
 
-def _fields(dtype: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], tuple[int, ...]]]:
+def _fields(dtype: np.dtype[np.void]) -> list[tuple[str, np.dtype[np.generic], tuple[int, ...]]]:
     fields = []
     for name in dtype.names or ():
         field = dtype[name]
@@ -262,11 +265,11 @@ def channels(header: Header) -> tuple[Channel, ...]:
     return tuple(Channel(number, *row) for number, row in enumerate(rows, start=1))
 
 
-def descriptor_set(message: Any) -> bytes:
+def descriptor_set(message: Descriptor) -> bytes:
     """Return the serialized FileDescriptorSet of a message with all the files it needs, each after its own needs."""
-    found: dict[str, Any] = {}
+    found: dict[str, FileDescriptor] = {}
 
-    def add(file: Any) -> None:
+    def add(file: FileDescriptor) -> None:
         for need in file.dependencies:
             add(need)
         found.setdefault(file.name, file)

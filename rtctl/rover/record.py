@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
+from rtctl.plain import Json
 from rtctl.rover.path import CORNERS
 from rtctl.rover.robot import SECTORS
 from rtctl.rover.signals import BaseFeedback
@@ -54,7 +55,7 @@ def make_base_record(slots: int, **values: Number) -> Record:
 def feedback_from(row: Record) -> BaseFeedback:
     """Return the feedback that a record was made from: with the requests of the log all that a replay needs."""
     kinds = {int: int, bool: bool, float: float}
-    values: dict[str, Any] = {}
+    values: Json = {}
     for name, kind in BaseFeedback.__annotations__.items():
         value = row[name]
         values[name] = np.array(value) if value.shape else kinds[kind](value)

@@ -4,7 +4,7 @@ Axis of capsule, segment, cylinder, cone, n_cylinder: local z. A plane is solid 
 """
 
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -269,7 +269,7 @@ def shape_of(obstacle: Obstacle, t: float = 0.0) -> Shape:
     )
 
 
-def contradiction(o: Obstacle) -> tuple[str, Any, str] | None:
+def contradiction(o: Obstacle) -> tuple[str, object, str] | None:
     """Return (key, what came, what was wanted) of the first pair of keys that contradict each other, or None."""
     if o.position_m is None and not o.waypoints:
         return "position_m", "nothing", "position_m or waypoints"
@@ -297,7 +297,7 @@ def contradiction(o: Obstacle) -> tuple[str, Any, str] | None:
     return orientation_contradiction(o.rpy_rad, o.wxyz)
 
 
-def orientation_contradiction(rpy: object, wxyz: tuple[float, ...] | None) -> tuple[str, Any, str] | None:
+def orientation_contradiction(rpy: object, wxyz: tuple[float, ...] | None) -> tuple[str, object, str] | None:
     """Return the contradiction of two orientations given at once, or of a quaternion that is none."""
     if wxyz is None:
         return None

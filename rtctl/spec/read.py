@@ -11,6 +11,7 @@ import msgspec
 from msgspec import inspect
 
 from rtctl.errors import ConfigError
+from rtctl.plain import Json
 
 T = TypeVar("T")
 MAX_BYTES = 1 << 20  # a config is a page or two; anything larger is the wrong file
@@ -20,7 +21,7 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _ABSENT = object()
 
 
-def parse(path: Path) -> dict[str, Any]:
+def parse(path: Path) -> Json:
     """Return the file's TOML as dicts and lists.
 
     Raises ConfigError naming the file, and line and column of a syntax error.

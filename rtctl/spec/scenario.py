@@ -2,12 +2,13 @@
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from rtctl.errors import ConfigError
+from rtctl.plain import Json
 from rtctl.spec.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
 from rtctl.spec.obstacles import (
     Coordinate,
@@ -114,22 +115,26 @@ def robot_file(scenario: Scenario, path: str | Path) -> Path:
     return found
 
 
-def scenario_dict(scenario: Scenario, path: str | Path = "scenario.toml") -> dict[str, Any]:
+def scenario_dict(scenario: Scenario, path: str | Path = "scenario.toml") -> Json:
     """Return the scenario as the plain values of its TOML, defaults filled in and absent keys left out.
 
     Files of meshes and clouds, relative to `path`, become absolute.
     """
-    plain = dict(_without_none(msgspec.to_builtins(scenario)))
+    plain = _without_none(msgspec.to_builtins(scenario))
     for table in plain["obstacle"]:
         if "file" in table:
             table["file"] = str(Path(path).resolve().parent / table["file"])
     return plain
 
 
-def _without_none(value: Any) -> Any:
+def _without_none(table: Json) -> Json:
+    return {key: _set(value) for key, value in table.items() if value is not None}
+
+
+def _set(value: object) -> object:
     if isinstance(value, dict):
-        return {k: _without_none(v) for k, v in value.items() if v is not None}
-    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value
+        return _without_none(value)
+    return [_set(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def parse_obstacle(data: object, source: str) -> Obstacle:

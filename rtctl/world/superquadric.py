@@ -20,7 +20,7 @@ _NONE = 2.0  # "this coordinate would leave the box": any value above 1 reads as
 _SAMPLES = 12  # per axis, inside: brackets of stationary points; tests hold the result to dense sampling
 
 
-class Axes(NamedTuple):
+class PerAxis(NamedTuple):
     """A number for each axis: of the frame's, or these turned round so that the one that is searched along is first."""
 
     a: float
@@ -230,7 +230,7 @@ def _rising(X: float, k: float, p: float) -> float:
 
 
 @kernel
-def _excess(t: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float, float]:
+def _excess(t: float, X: PerAxis, k: PerAxis, p: PerAxis) -> tuple[float, float, float]:
     """Return (sum t_i^p_i - 1, t_b, t_c) along the stationary curve on which axis a has coordinate t >= X; k: p/a^2."""
     m = (t - X.a) / (k.a * _power(t, p.a - 1.0))
     u, v = _rising(X.b, m * k.b, p.b), _rising(X.c, m * k.c, p.c)
@@ -240,7 +240,7 @@ def _excess(t: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float, float]:
 
 
 @kernel
-def _root(lo: float, hi: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float, float]:
+def _root(lo: float, hi: float, X: PerAxis, k: PerAxis, p: PerAxis) -> tuple[float, float, float]:
     """Return (t_a, t_b, t_c) where `_excess` turns from <= 0 at lo to >= 0 at hi: of the steps, the nearest to zero.
 
     Regula falsi (Illinois) where both ends have a value, bisection where the upper one has none and every third step.
@@ -265,7 +265,7 @@ def _root(lo: float, hi: float, X: Axes, k: Axes, p: Axes) -> tuple[float, float
 
 
 @kernel
-def _scaled(foot: Axes, X: Axes, size: Axes, p: float, pz: float) -> tuple[float, float, float, float]:
+def _scaled(foot: PerAxis, X: PerAxis, size: PerAxis, p: float, pz: float) -> tuple[float, float, float, float]:
     """Return (distance to it, t, u, v) of a candidate pushed radially onto the surface: always an upper bound."""
     t, u, v = foot
     k = 0.0
@@ -281,23 +281,23 @@ def _scaled(foot: Axes, X: Axes, size: Axes, p: float, pz: float) -> tuple[float
 
 
 @kernel
-def _back(v: Axes, order: int) -> Axes:
+def _back(v: PerAxis, order: int) -> PerAxis:
     """Return in x, y, z order what was turned round by `order` places."""
     if order == 0:
         return v
     if order == 1:  # (a, b, c) = (y, z, x)
-        return Axes(v.c, v.a, v.b)
-    return Axes(v.b, v.c, v.a)  # (a, b, c) = (z, x, y)
+        return PerAxis(v.c, v.a, v.b)
+    return PerAxis(v.b, v.c, v.a)  # (a, b, c) = (z, x, y)
 
 
 @kernel
-def _along(X: Axes, size: Axes, p: Axes, order: int, most: float) -> tuple[float, float, float, float]:
+def _along(X: PerAxis, size: PerAxis, p: PerAxis, order: int, most: float) -> tuple[float, float, float, float]:
     """Return the best stationary point on the curve of axis a as (distance, t, u, v) in x, y, z order, if below most.
 
     `order` says how many places (a, b, c) was rotated from (x, y, z). The distance is at least a (t - X), so `most`
     limits the range of t.
     """
-    k = Axes(p.a / (size.a * size.a), p.b / (size.b * size.b), p.c / (size.c * size.c))
+    k = PerAxis(p.a / (size.a * size.a), p.b / (size.b * size.b), p.c / (size.c * size.c))
     X_xyz, size_xyz, p_xyz = _back(X, order), _back(size, order), _back(p, order)
     best, bt, bu, bv = most, 0.0, 0.0, 0.0
     floor = max(X.a, 0.02)
@@ -310,7 +310,7 @@ def _along(X: Axes, size: Axes, p: Axes, order: int, most: float) -> tuple[float
         if lower <= 0.0 and upper >= 0.0 and size.a * (lo - X.a) < best:
             t, u, v = _root(lo, hi, X, k, p)
             # in x, y, z order again: the exponents of x and y are equal, so z must be at its place
-            d, t, u, v = _scaled(_back(Axes(t, u, v), order), X_xyz, size_xyz, p_xyz.a, p_xyz.c)
+            d, t, u, v = _scaled(_back(PerAxis(t, u, v), order), X_xyz, size_xyz, p_xyz.a, p_xyz.c)
             if d < best:
                 best, bt, bu, bv = d, t, u, v
         hi, upper = lo, lower
@@ -344,13 +344,13 @@ def _inside(
     d, s = _to_face(Z, X, Y, c, pz, p, p)
     if d < best:
         best, t, u, v = d, X, Y, s
-    d, t1, u1, v1 = _along(Axes(X, Y, Z), Axes(a, b, c), Axes(p, p, pz), 0, best)
+    d, t1, u1, v1 = _along(PerAxis(X, Y, Z), PerAxis(a, b, c), PerAxis(p, p, pz), 0, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
-    d, t1, u1, v1 = _along(Axes(Y, Z, X), Axes(b, c, a), Axes(p, pz, p), 1, best)
+    d, t1, u1, v1 = _along(PerAxis(Y, Z, X), PerAxis(b, c, a), PerAxis(p, pz, p), 1, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
-    d, t1, u1, v1 = _along(Axes(Z, X, Y), Axes(c, a, b), Axes(pz, p, p), 2, best)
+    d, t1, u1, v1 = _along(PerAxis(Z, X, Y), PerAxis(c, a, b), PerAxis(pz, p, p), 2, best)
     if d < best:
         best, t, u, v = d, t1, u1, v1
     return -best, p / a * _power(t, p - 1.0), p / b * _power(u, p - 1.0), pz / c * _power(v, pz - 1.0)

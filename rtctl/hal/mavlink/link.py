@@ -9,9 +9,11 @@ import os
 import struct
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+
+from rtctl.hal.mavlink.message import Message
 
 os.environ["MAVLINK20"] = "1"  # before pymavlink is imported: it starts as MAVLink 1 otherwise
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -229,13 +231,13 @@ class MavLink:
             return
         self.view.take(message, now)
 
-    def _acknowledged(self, message: Any, now: float) -> None:
+    def _acknowledged(self, message: Message, now: float) -> None:
         """Take a COMMAND_ACK that is for us."""
         for_us = message.target_system in (0, self.spec.system) and message.target_component in (0, self.spec.component)
         if for_us and self.talk.answer(int(message.command), int(message.result), now):
             self.view.answered(now)
 
-    def _discover(self, message: Any, source: tuple[int, int], address: Address) -> None:
+    def _discover(self, message: Message, source: tuple[int, int], address: Address) -> None:
         """Pin the vehicle by its heartbeat; others are passed over, and told of once.
 
         HandshakeError when the one that the config names by its id is another kind than it says: a file can cure that.
@@ -301,8 +303,8 @@ class MavLink:
         self.keys.keep()
         return went
 
-    def _housekeeping(self, now: float) -> list[Any]:
-        messages: list[Any] = []
+    def _housekeeping(self, now: float) -> list[Message]:
+        messages: list[Message] = []
         if now >= self._heartbeat_due:
             self._heartbeat_due = now + HEARTBEAT - 0.5 * self.spec.period
             messages.append(self._mav.heartbeat_encode(18, 8, 0, 0, 4))  # onboard controller, no autopilot, active
@@ -316,11 +318,13 @@ class MavLink:
     def _synced(self) -> bool:
         return not math.isnan(self.view.clock.offset)
 
-    def _command(self, order: Order, confirmation: int) -> Any:
+    def _command(self, order: Order, confirmation: int) -> Message:
         assert self.vehicle is not None
-        return self._mav.command_long_encode(*self.vehicle, order.command, confirmation, *order.parameters)
+        sender, parameters = self._mav, order.parameters
+        message: Message = sender.command_long_encode(*self.vehicle, order.command, confirmation, *parameters)
+        return message
 
-    def _steer(self, command: BaseCommand, now: float) -> list[Any]:
+    def _steer(self, command: BaseCommand, now: float) -> list[Message]:
         """Follow what is asked of the autopilot: its mode, its arming, and set-points while the mode is ours."""
         if command.ask != self._ask:
             self._turned(command.ask, now)
@@ -374,7 +378,7 @@ class MavLink:
         if ours and self.view.armed:
             self._word = Word.ACCEPTED
 
-    def _setpoint(self, command: BaseCommand) -> Any:
+    def _setpoint(self, command: BaseCommand) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED: forward speed and yaw rate, or for PX4 a velocity in the world."""
         assert self.vehicle is not None
         numbers = (command.v, command.w, float(command.velocity[0]), float(command.velocity[1]))
@@ -389,9 +393,10 @@ class MavLink:
             frame, mask = BODY_NED, VELOCITY_YAW_RATE
             vx, vy = v, 0.0  # not vy: a skid-steer rover takes hypot(vx, vy) as forward speed
         boot = round(self.wire.now() * 1e3) & 0xFFFFFFFF
-        return self._mav.set_position_target_local_ned_encode(
+        message: Message = self._mav.set_position_target_local_ned_encode(
             boot, *self.vehicle, frame, mask, 0.0, 0.0, 0.0, vx, vy, 0.0, 0.0, 0.0, 0.0, 0.0, -w
         )
+        return message
 
     # -- the start -----------------------------------------------------------------------------------------------
 
@@ -454,7 +459,7 @@ class MavLink:
         if name not in self.view.parameters:
             self._send(self._mav.param_request_read_encode(*self.vehicle, name.encode(), -1))
 
-    def _send(self, message: Any) -> None:
+    def _send(self, message: Message) -> None:
         self.wire.send([self.keys.signed(bytes(message.pack(self._mav)), message.crc_extra)])
 
     def _subscribe(self) -> None:

@@ -8,10 +8,11 @@ unknown. Angles leave here as the body's, counter-clockwise from the front.
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.hal.mavlink.message import Message
 from rtctl.rover.robot import SECTORS
 from rtctl.types import F64
 
@@ -98,7 +99,9 @@ class Ranging:
         """Return whether a message is a range sensor's."""
         return name in ("OBSTACLE_DISTANCE", "DISTANCE_SENSOR")
 
-    def take(self, message: Any, source: tuple[int, int], vehicle: int, pose: Pose, stamp: float, now: float) -> bool:
+    def take(
+        self, message: Message, source: tuple[int, int], vehicle: int, pose: Pose, stamp: float, now: float
+    ) -> bool:
         """Take a sensor's message that came at `now` [s], `stamp` [s] its own time by our clock; False: of nobody."""
         k = self._sensor(message.get_type(), source, vehicle, now)
         if k is None:
@@ -136,7 +139,7 @@ class Ranging:
             return k
         return None
 
-    def _obstacles(self, k: int, m: Any, yaw: float, at: float) -> Scan | None:
+    def _obstacles(self, k: int, m: Message, yaw: float, at: float) -> Scan | None:
         """72 sectors clockwise from angle_offset; max + 1: nothing there; 65535 and below the minimum: unknown."""
         spec = self.specs[k]
         increment = math.radians(m.increment_f if m.increment_f != 0.0 else m.increment)
@@ -154,7 +157,7 @@ class Ranging:
         start = spec.yaw - offset if body else 0.5 * math.pi - offset - yaw
         return Scan(k, ranges, math.remainder(start, 2.0 * math.pi), -increment, reach, at)
 
-    def _beam(self, spec: SensorSpec, m: Any, now: float) -> None:
+    def _beam(self, spec: SensorSpec, m: Message, now: float) -> None:
         if m.orientation >= 8 or m.signal_quality == 1:
             return
         k = (m.orientation - round(spec.yaw / (0.25 * math.pi))) % 8

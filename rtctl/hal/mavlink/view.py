@@ -5,11 +5,11 @@ east, north = y, x of NED        yaw = pi/2 - yaw of NED        yaw rate = -yaw 
 
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from rtctl.hal.mavlink.message import Message
 from rtctl.hal.mavlink.ranging import Pose, Ranging, SensorSpec
 from rtctl.rover.estimator import wrapped
 
@@ -97,7 +97,7 @@ class View:
         self._text: dict[int, dict[int, str]] = {}
         self._odometry = False
         self._home_looks = 0
-        self._handlers: dict[str, Callable[[Any, float], None]] = {
+        self._handlers: dict[str, Callable[[Message, float], None]] = {
             "HEARTBEAT": self._heartbeat, "LOCAL_POSITION_NED": self._local, "ODOMETRY": self._odometry_ned,
             "ATTITUDE": self._attitude, "EKF_STATUS_REPORT": self._ekf, "ESTIMATOR_STATUS": self._estimator,
             "STATUSTEXT": self._status_text, "GPS_RAW_INT": self._gps, "GLOBAL_POSITION_INT": self._global,
@@ -110,14 +110,14 @@ class View:
         self.fresh = 0
         self.ranging.cycle()
 
-    def sensed(self, message: Any, source: tuple[int, int], vehicle: int, now: float) -> bool:
+    def sensed(self, message: Message, source: tuple[int, int], vehicle: int, now: float) -> bool:
         """Take a range sensor's message of any component; return whether it is one that is listened to."""
         if not self.ranging.wants(message.get_type()):
             return False
         stamp = self.clock.ours(1e-6 * message.time_usec, now) if message.get_type() == "OBSTACLE_DISTANCE" else now
         return self.ranging.take(message, source, vehicle, Pose(self.position, self.yaw), stamp, now)
 
-    def take(self, message: Any, now: float) -> None:
+    def take(self, message: Message, now: float) -> None:
         """Take a message of the vehicle that came at `now` [s]."""
         handler = self._handlers.get(message.get_type())
         if handler is not None:
@@ -145,10 +145,10 @@ class View:
         """Take it that the vehicle has heard what we sent at `sent` [s]."""
         self.uplink_at = sent if math.isnan(self.uplink_at) else max(self.uplink_at, sent)
 
-    def _heartbeat(self, m: Any, now: float) -> None:
+    def _heartbeat(self, m: Message, now: float) -> None:
         self.heartbeat_at, self.mode, self.armed = now, int(m.custom_mode), bool(m.base_mode & 128)
 
-    def _local(self, m: Any, now: float) -> None:
+    def _local(self, m: Message, now: float) -> None:
         boot = 1e-3 * m.time_boot_ms
         if self._in_order("LOCAL_POSITION_NED", boot) and not self._odometry and _finite(m.x, m.y, m.vx, m.vy):
             self._moved(enu(m.x, m.y), enu(m.vx, m.vy), self.clock.ours(boot, now))
@@ -157,7 +157,7 @@ class View:
         self.position, self.velocity, self.position_at = np.array(position), np.array(velocity), at
         self.fresh += 1
 
-    def _odometry_ned(self, m: Any, now: float) -> None:
+    def _odometry_ned(self, m: Message, now: float) -> None:
         """ODOMETRY carries a reset counter; where it comes in the local frame it goes before LOCAL_POSITION_NED."""
         boot = 1e-6 * m.time_usec
         if not self._in_order("ODOMETRY", boot) or m.frame_id not in (1, 20) or not _finite(m.x, m.y, m.vx, m.vy, *m.q):
@@ -171,22 +171,22 @@ class View:
         self.reset = int(m.reset_counter)
         self._moved(enu(m.x, m.y), enu(*velocity), self.clock.ours(boot, now))
 
-    def _attitude(self, m: Any, now: float) -> None:
+    def _attitude(self, m: Message, now: float) -> None:
         boot = 1e-3 * m.time_boot_ms
         if self._in_order("ATTITUDE", boot) and _finite(m.yaw, m.yawspeed):
             self.yaw, self.yaw_rate, self.attitude_at = enu_yaw(m.yaw), -m.yawspeed, self.clock.ours(boot, now)
 
-    def _ekf(self, m: Any, now: float) -> None:
+    def _ekf(self, m: Message, now: float) -> None:
         worst = max(m.velocity_variance, m.pos_horiz_variance, m.compass_variance)
         self.healthy = _usable(m.flags) and worst < EKF_VARIANCE
         self.quality = _calm(worst, CALM_VARIANCE, EKF_VARIANCE)
 
-    def _estimator(self, m: Any, now: float) -> None:
+    def _estimator(self, m: Message, now: float) -> None:
         worst = max(m.vel_ratio, m.pos_horiz_ratio)
         self.healthy = _usable(m.flags) and worst < RATIO
         self.quality = _calm(worst, CALM_RATIO, RATIO)
 
-    def _gps(self, m: Any, now: float) -> None:
+    def _gps(self, m: Message, now: float) -> None:
         self.fix = int(m.fix_type)
         self.fixed = self.fixed or self.fix >= GOOD_FIX
 
@@ -195,10 +195,10 @@ class View:
         """Return whether a GPS that had a fix has none: the autopilot reckons on and says so seconds later."""
         return self.fixed and 0 <= self.fix < GOOD_FIX
 
-    def _home(self, m: Any, now: float) -> None:
+    def _home(self, m: Message, now: float) -> None:
         self.home = (1e-7 * m.latitude, 1e-7 * m.longitude)
 
-    def _global(self, m: Any, now: float) -> None:
+    def _global(self, m: Message, now: float) -> None:
         """Notice what LOCAL_POSITION_NED is relative to: old firmware tells it from home, which moves."""
         if self.origin is None or self.home is None or self._odometry:
             return
@@ -215,14 +215,14 @@ class View:
             self.relative_to_home, self._home_looks = from_home, 0
             self.say(f"LOCAL_POSITION_NED is relative to {'home, which moves' if from_home else 'the origin'}")
 
-    def _version(self, m: Any, now: float) -> None:
+    def _version(self, m: Message, now: float) -> None:
         v = int(m.flight_sw_version)
         firmware = (v >> 24 & 0xFF, v >> 16 & 0xFF, v >> 8 & 0xFF)
         if firmware != self.firmware and v:  # 0: it does not say
             self.firmware = firmware
             self.say(f"firmware {'.'.join(map(str, firmware))}" + _implied(self.autopilot, firmware))
 
-    def _status_text(self, m: Any, now: float) -> None:
+    def _status_text(self, m: Message, now: float) -> None:
         """Texts come in chunks of 50 bytes, joined by their id."""
         text = m.text if isinstance(m.text, str) else m.text.decode("ascii", "replace")
         if m.id == 0:
@@ -236,14 +236,14 @@ class View:
         elif len(self._text) > 8:
             self._text.pop(next(iter(self._text)))
 
-    def _parameter(self, m: Any, now: float) -> None:
+    def _parameter(self, m: Message, now: float) -> None:
         name = m.param_id if isinstance(m.param_id, str) else m.param_id.decode("ascii", "replace")
         self.parameters[name.rstrip("\0")] = float(m.param_value)
 
-    def _global_origin(self, m: Any, now: float) -> None:
+    def _global_origin(self, m: Message, now: float) -> None:
         self.origin = (1e-7 * m.latitude, 1e-7 * m.longitude)
 
-    def _timesync(self, m: Any, now: float) -> None:
+    def _timesync(self, m: Message, now: float) -> None:
         if m.tc1 > 0 and m.ts1 in self.asked:  # an answer to ours: ts1 is what we sent
             self.asked.remove(m.ts1)
             self.answered(1e-9 * m.ts1)
@@ -280,6 +280,6 @@ def _usable(flags: int) -> bool:
     return flags & GOOD_EKF == GOOD_EKF and bool(flags & POSITION_EKF) and not flags & BAD_EKF
 
 
-def _yaw_of(q: Any) -> float:
+def _yaw_of(q: Iterable[float]) -> float:
     w, x, y, z = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

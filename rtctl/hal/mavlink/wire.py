@@ -13,7 +13,7 @@ import socket
 import termios
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol, TypeAlias
 from urllib.parse import urlsplit
 
 from rtctl.errors import LinkError
@@ -23,7 +23,7 @@ DATAGRAMS = 256  # read in one go at most: a flood must not hold up the tick
 CHUNK = 65536
 RETRY = 1.0  # [s] between attempts to open a stream anew
 PEER_SILENT = 5.0  # [s] after which another address may take the pinned one's place
-Address = Any
+Address: TypeAlias = tuple[str | bytes | int, ...] | str | None  # as the socket module has it
 
 
 class Wire(Protocol):
@@ -80,7 +80,7 @@ class Udp(_Timed):
         if listen:
             self._socket.bind(info[4])
         else:
-            self._peer = info[4][:2]
+            self._peer = (info[4][0], info[4][1])
 
     def pin(self, address: Address) -> None:
         """Talk to this address alone."""

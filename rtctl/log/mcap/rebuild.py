@@ -1,9 +1,9 @@
 """A damaged file copied into a whole one: whatever can be read of it, with indices and an end made anew."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -28,6 +28,7 @@ from rtctl.log.mcap.walk import (
     parsed,
     walk,
 )
+from rtctl.plain import Json
 from rtctl.types import I64
 
 MARKS = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")  # in a chunk's head: where one may begin again behind damage
@@ -43,7 +44,7 @@ class Rebuilt(NamedTuple):
     written: int  # messages of the copy: those, and the sentinel
 
 
-def rebuild(data: Source, segment: Segment, content: Mapping[str, Any]) -> Rebuilt:
+def rebuild(data: Source, segment: Segment, content: Json) -> Rebuilt:
     """Copy what can be read of a file's bytes into an empty segment, and end it; content: of its sentinel if cut off.
 
     Raises Damaged when there is nothing to copy, OSError when the disk does not take it.

@@ -2,9 +2,8 @@
 
 import json
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mcap import records
@@ -30,6 +29,7 @@ from rtctl.log.mcap.walk import (
     parsed,
     walk,
 )
+from rtctl.plain import Json
 
 BAD = ".bad"  # suffix of a file of which nothing can be used
 
@@ -53,7 +53,7 @@ class _Scan(NamedTuple):
     whole: bool  # there is nothing to do but rename
 
 
-def recover(path: Path, content: Mapping[str, Any] | None = None) -> Recovery:
+def recover(path: Path, content: Json | None = None) -> Recovery:
     """Close a `.open` file in place and give it its name.
 
     content: of the /log/sentinel that says why it ends.
@@ -126,7 +126,7 @@ def drop_last_chunk(path: Path) -> bool:
     return bool(chunks)
 
 
-def sentinel(summary: Summary, content: Mapping[str, Any]) -> Encoded:
+def sentinel(summary: Summary, content: Json) -> Encoded:
     """Return the sentinel for the file's last moment; nothing when the file has no channel for it."""
     for channel in summary.channels:
         if channel.topic == schema.SENTINEL:

@@ -1,9 +1,10 @@
 """Message records as bytes, many of one kind at a time: a template of each, its fields written as columns."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rtctl.log.entry import Payload
 from rtctl.log.schema import MESSAGE, Layout
@@ -31,7 +32,7 @@ class Rows(NamedTuple):
 
 def rows_for(parts: Sequence[tuple[int, Layout]]) -> Rows:
     """Return the rows that hold one message of each (channel, layout), one behind the other."""
-    fields: list[tuple[str, Any]] = []
+    fields: list[tuple[str, np.dtype[np.void]]] = []
     for number, (_, layout) in enumerate(parts):
         fields += [(f"head{number}", MESSAGE), (f"body{number}", layout.wire)]
     dtype = np.dtype(fields)
@@ -61,7 +62,7 @@ def copies(template: U8, n: int) -> U8:
     return block
 
 
-def stamped(head: np.ndarray[Any, Any], stamp: I64, sequence: I64) -> None:
+def stamped(head: NDArray[np.void], stamp: I64, sequence: I64) -> None:
     """Write log_time [ns] and sequence numbers into the heads of rows."""
     head["sequence"], head["log"], head["publish"] = sequence, stamp, stamp
 

@@ -2,10 +2,11 @@
 
 import struct
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+Number: TypeAlias = np.floating | np.integer | np.bool_
 ULPS = 1_000_000  # beyond this many, units of the last place say nothing
 
 
@@ -78,7 +79,7 @@ def unit_of(name: str) -> str:
     return FIELDS[name].unit if name in FIELDS else ""
 
 
-def size_of(name: str, a: Any, b: Any) -> str:
+def size_of(name: str, a: Number, b: Number) -> str:
     """Return how far two values of a field are apart, in its unit and in units of the last place."""
     if not isinstance(a, np.floating):
         return str(int(b) - int(a))

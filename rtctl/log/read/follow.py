@@ -2,11 +2,12 @@
 
 import contextlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from rtctl.errors import LogError
 from rtctl.log import limits, schema
@@ -15,6 +16,7 @@ from rtctl.log.mcap.summary import MAGIC
 from rtctl.log.mcap.walk import MESSAGE, RECORD, Damaged, chunk_data, chunk_head, chunk_messages, parsed, walk
 from rtctl.log.read.reader import read
 from rtctl.log.read.topic import Part, Topic
+from rtctl.plain import Json
 
 MOST = 2 * limits.CHUNK  # [bytes] read at a look
 
@@ -22,9 +24,9 @@ MOST = 2 * limits.CHUNK  # [bytes] read at a look
 class News(NamedTuple):
     """What a look at the file brought."""
 
-    ticks: np.ndarray[Any, np.dtype[np.void]]  # the records that are new; empty for another program's log
-    events: list[dict[str, Any]]
-    ended: dict[str, Any]  # the sentinel; {} while it is being written
+    ticks: NDArray[np.void]  # the records that are new; empty for another program's log
+    events: list[Json]
+    ended: Json  # the sentinel; {} while it is being written
 
 
 class Tail:
@@ -51,9 +53,9 @@ class Tail:
                 data = file.read(MOST)
         except OSError as error:
             raise LogError(f"{self.path}: {error.strerror}") from None
-        found: list[np.ndarray[Any, Any]] = []
-        events: list[dict[str, Any]] = []
-        ended: dict[str, Any] = {}
+        found: list[NDArray[np.void]] = []
+        events: list[Json] = []
+        ended: Json = {}
         used = 0
         for opcode, body, end in walk(data, 0, len(data)):
             used = end

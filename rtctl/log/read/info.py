@@ -1,7 +1,6 @@
 """What a log is, at a glance: from its end when it is whole, by reading it when it is not."""
 
 from pathlib import Path
-from typing import Any
 
 from rtctl.errors import LogError
 from rtctl.log import schema
@@ -9,9 +8,10 @@ from rtctl.log.mcap.names import INFO
 from rtctl.log.mcap.summary import WRAP
 from rtctl.log.read.examine import missing_numbers
 from rtctl.log.read.reader import Log, read
+from rtctl.plain import Json
 
 
-def info(path: Path | str) -> dict[str, Any]:
+def info(path: Path | str) -> Json:
     """Return duration; per topic n, Hz and sequence holes; dropouts, exit cause, versions, config hash.
 
     Raises LogError when the file cannot be read or is not an MCAP file.
@@ -53,12 +53,12 @@ def holes(log: Log, name: str, count: int, first: int, last: int) -> int:
     return sum(missing_numbers(numbers) or 0 for numbers in log.sequences(name))
 
 
-def _count(dropout: dict[str, Any]) -> int:
+def _count(dropout: Json) -> int:
     count = dropout.get("count", 0)
     return count if isinstance(count, int) else 0
 
 
-def _origin(log: Log) -> dict[str, Any]:
+def _origin(log: Log) -> Json:
     """Return what the header says; {} for the logs of other programs."""
     try:
         header = log.header

@@ -4,7 +4,7 @@ import contextlib
 import mmap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from mcap import records
@@ -21,6 +21,7 @@ from rtctl.log.mcap.walk import (
 )
 from rtctl.log.read.chunks import ChunkReader
 from rtctl.log.read.topic import Part, Topic
+from rtctl.plain import Json
 from rtctl.types import I64
 
 T = TypeVar("T")
@@ -188,7 +189,7 @@ class Log:
         return self._topics[topic]
 
     @property
-    def events(self) -> list[dict[str, Any]]:
+    def events(self) -> list[Json]:
         """Return the events as they were put, each with its `log_time` [ns]."""
         if schema.EVENT not in self:
             return []
@@ -196,13 +197,13 @@ class Log:
         return [{**m.get("data", m), "log_time": t} for m, t in zip(topic.json, topic.time.tolist(), strict=True)]
 
     @property
-    def sentinel(self) -> dict[str, Any]:
+    def sentinel(self) -> Json:
         """Return why the file ends; {} when nothing says so: it is still being written, or was cut off."""
         found = self[schema.SENTINEL].json if schema.SENTINEL in self else []
         return found[-1] if found else {}
 
     @property
-    def dropouts(self) -> list[dict[str, Any]]:
+    def dropouts(self) -> list[Json]:
         """Return the spans in which entries are missing, each with its `count`."""
         return self[schema.DROPOUT].json if schema.DROPOUT in self.counts else []
 

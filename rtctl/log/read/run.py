@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import NamedTuple, TypeVar, overload
 
 from rtctl.errors import LogError
 from rtctl.log import limits
@@ -14,6 +14,7 @@ from rtctl.log.mcap.names import beside
 from rtctl.log.mcap.walk import I64_MAX
 from rtctl.log.read.reader import Log, read
 from rtctl.log.read.topic import Part, Topic
+from rtctl.plain import Json
 
 T = TypeVar("T")
 OPEN_AT_ONCE = 16  # files of a run
@@ -94,17 +95,17 @@ class Run:
         return (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else (0, 0)
 
     @property
-    def events(self) -> list[dict[str, Any]]:
+    def events(self) -> list[Json]:
         """Return the events of all segments, each with its `log_time` [ns]."""
         return [event for log in self.logs for event in log.events]
 
     @property
-    def sentinel(self) -> dict[str, Any]:
+    def sentinel(self) -> Json:
         """Return why the last file ends; {} when nothing says so."""
         return self.logs[-1].sentinel
 
     @property
-    def dropouts(self) -> list[dict[str, Any]]:
+    def dropouts(self) -> list[Json]:
         """Return the dropouts of all segments."""
         return [d for log in self.logs for d in log.dropouts]
 

@@ -7,16 +7,18 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from mcap import records
+from numpy.typing import NDArray
 
 from rtctl.errors import LogError
 from rtctl.log import limits, schema
 from rtctl.log.mcap.walk import Source, rows_of
 from rtctl.log.schema import Layout, can_layout, tick_layout
-from rtctl.types import I64, U8
+from rtctl.plain import Json
+from rtctl.types import I64, U8, Array
 
 OBJECT = 64  # [bytes] that a message costs beside its own, once it is an object
 STAMPS = 16  # [bytes] of a message's time and sequence number
-Structured = np.ndarray[Any, np.dtype[np.void]]
+Structured = NDArray[np.void]
 CAN_ROW = np.dtype(  # of Topic.array for a bus
     [
         ("stamp_ns", "<u8"),
@@ -90,7 +92,7 @@ class Topic:
     def __len__(self) -> int:
         return len(self.time)
 
-    def __getattr__(self, field: str) -> np.ndarray[Any, Any]:
+    def __getattr__(self, field: str) -> Array:
         if field.startswith("_"):
             raise AttributeError(field)
         try:
@@ -98,7 +100,7 @@ class Topic:
         except LogError as error:
             raise AttributeError(str(error)) from None
 
-    def field(self, name: str) -> np.ndarray[Any, Any]:
+    def field(self, name: str) -> Array:
         """Return one field (N, ...); `time` here is the record's robot time [s], the attribute is log_time.
 
         Raises LogError when the topic has no such field.
@@ -180,7 +182,7 @@ class Topic:
         return stacked([rows for rows, _, _ in found], dtype)
 
     @property
-    def json(self) -> list[dict[str, Any]]:
+    def json(self) -> list[Json]:
         """Return the messages of a JSON topic; one that is not a JSON object becomes {"raw": text}."""
         return [_json(payload) for payload in self.payloads]
 
@@ -202,7 +204,7 @@ class _Ticks:
         self._held = Held(name, most)
         self.layout = tick_layout(dtype)
         self._times: tuple[I64, I64] | None = None
-        self._found: dict[str, np.ndarray[Any, Any]] = {}
+        self._found: dict[str, Array] = {}
 
     def load(self, names: Sequence[str]) -> None:
         """Read fields that are not there yet in one pass over the file."""
@@ -243,7 +245,7 @@ class _Ticks:
         assert self._times is not None
         return self._times
 
-    def field(self, name: str) -> np.ndarray[Any, Any]:
+    def field(self, name: str) -> Array:
         """Return one field (N, ...)."""
         self.load((name,))
         return self._found[name]
@@ -307,7 +309,7 @@ def _frames(name: str, part: Part) -> Structured:
     return array
 
 
-def _json(payload: bytes) -> dict[str, Any]:
+def _json(payload: bytes) -> Json:
     try:
         value = json.loads(payload)
     except (ValueError, RecursionError):

@@ -8,7 +8,7 @@ checkpoint is data from a file: whatever would not fit this robot's memory, arra
 from collections.abc import Iterator
 from enum import Enum
 from functools import cache
-from typing import Any, NamedTuple, get_args, get_type_hints
+from typing import NamedTuple, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -17,7 +17,8 @@ from rtctl.arm.escape import DIRECTIONS, Phase
 from rtctl.arm.flat import shapes_of
 from rtctl.arm.memory import HOT, Memory, record_of
 from rtctl.arm.robot import Robot
-from rtctl.types import Severity, State, Status, Task
+from rtctl.plain import Json
+from rtctl.types import Array, Severity, State, Status, Task
 from rtctl.world.primitives import MESH
 
 PERIOD = 5.0  # [s] of robot time between two
@@ -57,7 +58,8 @@ def decode_checkpoint(data: bytes, robot: Robot, template: Memory) -> Checkpoint
         raw = _Raw(msgspec.convert(body["data"], bytes))
         hints = get_type_hints(Memory)
         values = zip(Memory.__struct_fields__, body["memory"], strict=True)
-        memory = Memory(**{name: _value(node, hints[name], raw) for name, node in values})
+        fields: Json = {name: _value(node, hints[name], raw) for name, node in values}
+        memory = Memory(**fields)
         memory = _with_meshes(memory, robot)
         _check(memory, template)
         shapes = shapes_of(
@@ -82,10 +84,10 @@ def _layouts() -> Iterator[tuple[str, tuple[str, ...]]]:
 
 
 @cache
-def _kinds() -> dict[str, Any]:
+def _kinds() -> Json:
     """Return the named tuples that a memory may hold, by name."""
-    found: dict[str, Any] = {}
-    waiting: list[Any] = [Memory]
+    found: Json = {}
+    waiting: list[type] = [Memory]
     while waiting:
         for hint in get_type_hints(waiting.pop()).values():
             for kind in (hint, *get_args(hint)):
@@ -95,7 +97,7 @@ def _kinds() -> dict[str, Any]:
     return found
 
 
-def _plain(value: Any, blobs: list[bytes]) -> Any:
+def _plain(value: object, blobs: list[bytes]) -> object:
     """Return a value as JSON knows it; arrays are appended to blobs."""
     if isinstance(value, np.ndarray):
         blobs.append(value.tobytes())
@@ -111,7 +113,7 @@ def _plain(value: Any, blobs: list[bytes]) -> Any:
     return {"x": value.hex()} if isinstance(value, float) else value  # JSON has no infinity
 
 
-def _named(value: Any) -> Iterator[tuple[str, Any]]:
+def _named(value: tuple[object, ...]) -> Iterator[tuple[str, object]]:
     names = getattr(value, "_fields", None)
     return zip(names, value, strict=True) if names else (("-", each) for each in value)
 
@@ -122,7 +124,7 @@ class _Raw:
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
 
-    def take(self, dtype: "np.dtype[Any]", shape: tuple[int, ...]) -> Any:
+    def take(self, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> Array:
         count = int(np.prod(shape, dtype=np.int64))
         if dtype.hasobject or count < 0:
             raise ValueError("not a checkpoint: an array of no numbers")
@@ -131,7 +133,7 @@ class _Raw:
         return found
 
 
-def _value(node: Any, hint: Any, raw: _Raw) -> Any:
+def _value(node: object, hint: object, raw: _Raw) -> object:
     if isinstance(node, dict) and "a" in node:
         return raw.take(np.dtype(node["a"]), tuple(node["s"]))
     if isinstance(node, dict) and "n" in node:
@@ -180,13 +182,14 @@ def _check(memory: Memory, template: Memory) -> None:
         raise ValueError("not a checkpoint: escape")
 
 
-def _like(value: Any, wanted: Any, place: str) -> None:
+def _like(value: object, wanted: object, place: str) -> None:
     if isinstance(wanted, np.ndarray):
         fits = isinstance(value, np.ndarray) and (value.dtype, value.shape) == (wanted.dtype, wanted.shape)
     elif isinstance(wanted, tuple):
-        fits = type(value) is type(wanted) and len(value) == len(wanted)
-        for k, (a, b) in enumerate(zip(value, wanted, strict=True)) if fits else ():
-            _like(a, b, f"{place}.{wanted._fields[k] if hasattr(wanted, '_fields') else k}")
+        fits = isinstance(value, tuple) and type(value) is type(wanted) and len(value) == len(wanted)
+        if isinstance(value, tuple) and fits:
+            for k, (a, b) in enumerate(zip(value, wanted, strict=True)):
+                _like(a, b, f"{place}.{wanted._fields[k] if hasattr(wanted, '_fields') else k}")
     else:
         fits = isinstance(value, type(wanted.item() if isinstance(wanted, np.generic) else wanted))
     if not fits:

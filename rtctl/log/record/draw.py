@@ -1,14 +1,24 @@
 """Primitives of the foxglove schemas: what 3D viewers draw."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from google.protobuf.timestamp_pb2 import Timestamp
 
+from rtctl.plain import Json
 from rtctl.types import F64
 
+Solid: TypeAlias = SpherePrimitive | CubePrimitive | CylinderPrimitive
 Colour = tuple[float, float, float, float]
 
 WORLD = "world"
@@ -20,7 +30,7 @@ WHITE: Colour = (0.9, 0.9, 0.9, 1.0)
 SHEER = 0.3  # of a plane's colour: what is behind it is seen
 
 
-def rotation(wxyz: Any) -> F64:
+def rotation(wxyz: Iterable[float]) -> F64:
     """Return the rotation (3, 3) of a unit quaternion."""
     w, x, y, z = (float(v) for v in wxyz)
     return np.array(
@@ -64,7 +74,7 @@ def along(direction: F64) -> tuple[float, float, float, float]:
     return w / size, 0.0, -z / size, y / size
 
 
-def obstacle(entity: Any, shape: dict[str, Any], boxes: F64, elapsed: float, colour: Colour) -> None:
+def obstacle(entity: SceneEntity, shape: Json, boxes: F64, elapsed: float, colour: Colour) -> None:
     """Add the primitives of one obstacle, `elapsed` [s] after it was where its shape says.
 
     boxes (k, 6) [m]: least and greatest x y z in its frame, for a mesh or a cloud.
@@ -104,18 +114,20 @@ def obstacle(entity: Any, shape: dict[str, Any], boxes: F64, elapsed: float, col
     put(text.pose, p, wxyz)
 
 
-def ball(entity: Any, centre: Any, radius: float, colour: Colour) -> None:
+def ball(entity: SceneEntity, centre: Iterable[float], radius: float, colour: Colour) -> None:
     """Add a sphere."""
     solid(entity.spheres.add(color=paint_of(colour)), centre, (1.0, 0.0, 0.0, 0.0), [2.0 * radius] * 3)
 
 
-def disc(entity: Any, centre: Any, radius: float, height: float, colour: Colour) -> None:
+def disc(entity: SceneEntity, centre: Iterable[float], radius: float, height: float, colour: Colour) -> None:
     """Add an upright cylinder."""
     one = entity.cylinders.add(color=paint_of(colour), bottom_scale=1.0, top_scale=1.0)
     solid(one, centre, (1.0, 0.0, 0.0, 0.0), [2.0 * radius, 2.0 * radius, height])
 
 
-def arrow(entity: Any, start: Any, direction: F64, length: float, colour: Colour, thick: float = 0.012) -> None:
+def arrow(
+    entity: SceneEntity, start: Iterable[float], direction: F64, length: float, colour: Colour, thick: float = 0.012
+) -> None:
     """Add an arrow along a unit vector."""
     head = 2.5 * thick
     one = entity.arrows.add(shaft_diameter=thick, head_diameter=head, head_length=head, shaft_length=length)
@@ -123,7 +135,7 @@ def arrow(entity: Any, start: Any, direction: F64, length: float, colour: Colour
     put(one.pose, start, along(direction))
 
 
-def strip(entity: Any, corners: F64, thick: float, colour: Colour) -> None:
+def strip(entity: SceneEntity, corners: F64, thick: float, colour: Colour) -> None:
     """Add a line through corners (k, 3)."""
     one = entity.lines.add(type=0, thickness=thick, color=paint_of(colour))
     one.pose.orientation.w = 1.0
@@ -131,13 +143,13 @@ def strip(entity: Any, corners: F64, thick: float, colour: Colour) -> None:
         one.points.add(x=x, y=y, z=z)
 
 
-def solid(primitive: Any, position: F64, wxyz: Any, size: Sequence[float]) -> None:
+def solid(primitive: Solid, position: Iterable[float], wxyz: Iterable[float], size: Sequence[float]) -> None:
     """Give a primitive its pose and its whole extents [m]."""
     put(primitive.pose, position, wxyz)
     primitive.size.x, primitive.size.y, primitive.size.z = size
 
 
-def put(pose: Any, position: Any, wxyz: Any) -> None:
+def put(pose: Pose, position: Iterable[float], wxyz: Iterable[float]) -> None:
     pose.position.x, pose.position.y, pose.position.z = (float(v) for v in position)
     o = pose.orientation
     o.w, o.x, o.y, o.z = (float(v) for v in wxyz)
@@ -147,14 +159,14 @@ def paint_of(colour: Colour) -> Color:
     return Color(r=colour[0], g=colour[1], b=colour[2], a=colour[3])
 
 
-def entity_of(message: Any, name: str, ns: int, frame: str = WORLD) -> Any:
+def entity_of(message: SceneUpdate, name: str, ns: int, frame: str = WORLD) -> SceneEntity:
     """Add an entity to a SceneUpdate at log_time `ns`: it replaces the one of that name."""
-    entity = message.entities.add(id=name, frame_id=frame, frame_locked=frame != WORLD)
+    entity: SceneEntity = message.entities.add(id=name, frame_id=frame, frame_locked=frame != WORLD)
     stamped(entity.timestamp, ns)
     return entity
 
 
-def frame(message: Any, ns: int, parent: str, child: str, X: F64) -> None:
+def frame(message: FrameTransforms, ns: int, parent: str, child: str, X: F64) -> None:
     """Add to FrameTransforms where (4, 4) a frame is in its parent."""
     one = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
     stamped(one.timestamp, ns)
@@ -162,5 +174,5 @@ def frame(message: Any, ns: int, parent: str, child: str, X: F64) -> None:
     one.rotation.w, one.rotation.x, one.rotation.y, one.rotation.z = quaternion(X[:3, :3])
 
 
-def stamped(target: Any, ns: int) -> None:
+def stamped(target: Timestamp, ns: int) -> None:
     target.seconds, target.nanos = ns // 1_000_000_000, ns % 1_000_000_000

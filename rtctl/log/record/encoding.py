@@ -2,7 +2,6 @@
 
 import json
 from collections import deque
-from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -15,7 +14,8 @@ from rtctl.log.record.rover_scene import BaseScene
 from rtctl.log.record.scene import Scene
 from rtctl.log.record.surroundings import HZ, Drawing
 from rtctl.log.schema import MESSAGE
-from rtctl.types import I64, U8
+from rtctl.plain import Json
+from rtctl.types import I64, U8, Array, RecordRow
 
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
 LEVELS = {"rejected": WARNING, "fault": ERROR}  # by the event's name
@@ -102,7 +102,7 @@ class Encoder:
         self._recent.extend(bytes(each) for each in ticks[-EVIDENCE:])  # the ring's memory is not ours to keep
         return found
 
-    def _views(self, record: Any, time: int) -> list[Encoded]:
+    def _views(self, record: RecordRow, time: int) -> list[Encoded]:
         period = round(1e9 / HZ)
         self._due = max(self._due + period, time - period) if self._due else time + period
         if not self._scene.can_show(record):
@@ -131,7 +131,7 @@ class Encoder:
         message.timestamp.seconds, message.timestamp.nanos = stamp // 1_000_000_000, stamp % 1_000_000_000
         return self._message(schema.LOG, time, message.SerializeToString(deterministic=True))
 
-    def own(self, topic: str, time: int, content: dict[str, Any]) -> Encoded:
+    def own(self, topic: str, time: int, content: Json) -> Encoded:
         """Return one message of the recorder itself; time: monotonic [ns]."""
         return self._message(topic, time, json.dumps(content).encode())
 
@@ -294,7 +294,7 @@ class Encoder:
         return [self._dropout(count, since, time)]
 
 
-def event_of(payload: bytes) -> dict[str, Any]:
+def event_of(payload: bytes) -> Json:
     """Return the JSON object of an event or request; {"message": text} for anything else."""
     try:
         data = json.loads(payload)
@@ -311,17 +311,17 @@ def event_is_object(payload: bytes) -> bool:
         return False
 
 
-def text_of(event: dict[str, Any]) -> str:
+def text_of(event: Json) -> str:
     """Return an event as people read it."""
     return str(event.get("message") or ": ".join(str(event[key]) for key in ("name", "detail") if event.get(key)))
 
 
-def level_of(event: dict[str, Any]) -> int:
+def level_of(event: Json) -> int:
     """Return the level of foxglove.Log: 2 info, 3 warning, 4 error."""
     return LEVELS.get(str(event.get("name")), INFO)
 
 
-def _plain(values: np.ndarray[Any, Any]) -> Any:
+def _plain(values: Array) -> object:
     """Return numbers for JSON, which has no infinities: those become null."""
     if values.dtype.kind != "f":
         return values.tolist()

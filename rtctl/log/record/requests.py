@@ -1,17 +1,17 @@
 """Requests and events as JSON: the only inputs of a tick that have no fixed size. Floats round-trip to the bit."""
 
 import base64
-from typing import Any
 
 import msgspec
 import numpy as np
 
+from rtctl.plain import Json
 from rtctl.types import Goal, ObstacleEdit, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
     """Return the JSON of what the tick of index `tick` was asked."""
-    body: dict[str, Any] = {"tick": tick, "verb": request.verb.name.lower()}
+    body: Json = {"tick": tick, "verb": request.verb.name.lower()}
     if request.goal is not None:
         body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items() if v is not None}
     if request.obstacles:
@@ -46,15 +46,15 @@ def encode_event(tick: int, time: float, name: str, detail: str) -> bytes:
     return msgspec.json.encode({"tick": tick, "time": time, "name": name, "detail": detail})
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def _shape(shape: Shape) -> dict[str, Any]:
+def _shape(shape: Shape) -> Json:
     return {k: _plain(v) for k, v in shape._asdict().items()}
 
 
-def _shape_of(body: dict[str, Any]) -> Shape:
+def _shape_of(body: Json) -> Shape:
     numbers = {k: np.array(body[k], np.float64) for k in ("dims", "position", "wxyz", "velocity", "omega")}
     return Shape(
         body["name"],
@@ -70,7 +70,7 @@ def _shape_of(body: dict[str, Any]) -> Shape:
     )
 
 
-def _goal(body: dict[str, Any]) -> Goal:
+def _goal(body: Json) -> Goal:
     return Goal(
         np.array(body["position"], np.float64),
         np.array(body["wxyz"], np.float64),

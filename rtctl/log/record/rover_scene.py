@@ -1,15 +1,17 @@
 """What a mobile base and its surroundings look like, for 3D viewers: footprint, way, scan, goal, speed, obstacles."""
 
 import math
-from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from rtctl.log.header import Header
 from rtctl.log.record import draw
 from rtctl.log.record.scene import BODY
 from rtctl.log.record.surroundings import Drawing
+from rtctl.types import RecordRow
 
 BASE_LINK = "base_link"
 TALL = 0.2  # [m] of what is flat: footprint and goal
@@ -26,7 +28,7 @@ class BaseScene(Drawing):
         super().__init__(header)
         self.points = [[float(v) for v in p] for p in self.about.get("points", ()) if len(p) == 3]
 
-    def frames(self, record: Any, ns: int) -> bytes:
+    def frames(self, record: RecordRow, ns: int) -> bytes:
         """Return foxglove.FrameTransforms of the estimated pose at log_time `ns`."""
         message = FrameTransforms()
         X = np.eye(4)
@@ -36,7 +38,7 @@ class BaseScene(Drawing):
         data: bytes = message.SerializeToString(deterministic=True)
         return data
 
-    def own(self, message: Any, record: Any, ns: int) -> None:
+    def own(self, message: SceneUpdate, record: RecordRow, ns: int) -> None:
         """Add the goal, the way there, what the scan saw and the speed."""
         x, goal = record["x"], draw.entity_of(message, "goal", ns)
         draw.disc(goal, record["goal"], 0.1, TALL, draw.GREEN)
@@ -48,14 +50,14 @@ class BaseScene(Drawing):
         if speed > SLOWEST:
             draw.arrow(entity, x, np.append(record["v_world"] / speed, 0.0), SPEED * speed, draw.RED, 0.04)
 
-    def body(self, message: Any) -> None:
+    def body(self, message: SceneUpdate) -> None:
         """Add the footprint's points."""
         body = draw.entity_of(message, "body", 0, BASE_LINK)
         for x, y, radius in self.points:
             draw.disc(body, (x, y, 0.5 * TALL), radius, TALL, BODY)
 
     @staticmethod
-    def _seen(entity: Any, record: Any) -> None:
+    def _seen(entity: SceneEntity, record: RecordRow) -> None:
         """Add where the scan met something, from the pose of now: it is younger than a turn of the sensor."""
         ranges = record["scan"]
         sectors = np.flatnonzero(np.isfinite(ranges) & (ranges > 0.0))

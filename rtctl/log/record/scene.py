@@ -6,15 +6,17 @@ Everything is worked out in the recorder process from the record, the requests a
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from rtctl.log.header import Header
 from rtctl.log.record import draw
 from rtctl.log.record.surroundings import Drawing
-from rtctl.types import F64
+from rtctl.types import F64, RecordRow
 
 NEWTON = 0.004  # [m] length of an arrow for 1 N
 SEEN = 2.0  # [N] smaller forces are not drawn
@@ -48,7 +50,7 @@ class Scene(Drawing):
         self.radii = [float(p[4]) if len(p) == 5 else 0.0 for p in points]  # logs of before they were drawn have none
         self._carriers = _carriers(self.links, len(header.joints))
 
-    def frames(self, record: Any, ns: int) -> bytes:
+    def frames(self, record: RecordRow, ns: int) -> bytes:
         """Return foxglove.FrameTransforms of every link and of the estimated tip at log_time `ns`."""
         message = FrameTransforms()
         draw.frame(message, ns, draw.WORLD, self.root, self.base)
@@ -60,13 +62,13 @@ class Scene(Drawing):
         data: bytes = message.SerializeToString(deterministic=True)
         return data
 
-    def own(self, message: Any, record: Any, ns: int) -> None:
+    def own(self, message: SceneUpdate, record: RecordRow, ns: int) -> None:
         """Add the goal and the forces as arrows."""
         goal = draw.entity_of(message, "goal", ns)
         draw.ball(goal, record["goal"], 0.015, draw.GREEN)
         self._forces(draw.entity_of(message, "forces", ns), record)
 
-    def body(self, message: Any) -> None:
+    def body(self, message: SceneUpdate) -> None:
         """Add the points subjected to the potential: on each link those that it carries."""
         for carrier, chain in enumerate(self._carriers):
             mine = [(p, r) for (c, p), r in zip(self.points, self.radii, strict=True) if c == carrier and r > 0.0]
@@ -76,7 +78,7 @@ class Scene(Drawing):
             for local, radius in mine:
                 draw.ball(body, local[:3], radius, BODY)
 
-    def _forces(self, entity: Any, record: Any) -> None:
+    def _forces(self, entity: SceneEntity, record: RecordRow) -> None:
         force = record["force"]
         size = np.linalg.norm(force, axis=1)
         for slot in np.flatnonzero(np.isfinite(size) & (size > SEEN)).tolist():
@@ -84,7 +86,7 @@ class Scene(Drawing):
             length = max(0.01, min(0.5, float(size[slot]) * NEWTON))
             draw.arrow(entity, start, force[slot] / size[slot], length, draw.RED)
 
-    def _point(self, record: Any, index: int) -> F64:
+    def _point(self, record: RecordRow, index: int) -> F64:
         """Return where (3,) [m] a point of the arm is; the tip when it is not known."""
         if not 0 <= index < len(self.points):
             return np.asarray(record["x"])
@@ -164,7 +166,7 @@ def _rpy(rpy: F64) -> F64:
     return np.asarray(_turn(z, float(rpy[2])) @ _turn(y, float(rpy[1])) @ _turn(x, float(rpy[0])))
 
 
-def _pose(about: Any) -> F64:
+def _pose(about: object) -> F64:
     X = np.eye(4)
     if isinstance(about, dict):
         X[:3, :3], X[:3, 3] = draw.rotation(about.get("wxyz", (1, 0, 0, 0))), about.get("position", (0, 0, 0))

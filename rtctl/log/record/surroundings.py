@@ -7,14 +7,15 @@ import base64
 import json
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from rtctl.log.header import SCENE_FILE, Header, meshes_of
 from rtctl.log.record import draw
-from rtctl.types import F64
+from rtctl.plain import Json
+from rtctl.types import F64, RecordRow
 from rtctl.world import tree
 from rtctl.world.meshes import Meshes
 from rtctl.world.primitives import LARGEST, NUMBERS
@@ -28,7 +29,7 @@ BOUND = 1e6  # [m, rad, N] of anything drawn; comparing is false for NaN
 class Thing(NamedTuple):
     """An obstacle as it was last told."""
 
-    shape: dict[str, Any]
+    shape: Json
     time: float  # [s] robot time for which its position holds
     boxes: F64  # (k, 6) [m] of a mesh or a cloud, see draw.obstacle
 
@@ -61,7 +62,7 @@ class Surroundings:
             for each in [n for n in self._things if name in (n, "*") and n not in self._fixed]:
                 self._clear(each)
 
-    def _set(self, shape: dict[str, Any], time: float) -> None:
+    def _set(self, shape: Json, time: float) -> None:
         name = str(shape.get("name", ""))
         if name not in self._things:
             if "" not in self._slots:
@@ -69,7 +70,7 @@ class Surroundings:
             self._slots[self._slots.index("")] = name
         self._things[name] = Thing(shape, time, self._boxes_of(shape))
 
-    def _boxes_of(self, shape: dict[str, Any]) -> F64:
+    def _boxes_of(self, shape: Json) -> F64:
         """Return (k, 6) [m] boxes about the surface of a mesh or the points of a cloud; none for other shapes."""
         try:
             if shape.get("type") == "mesh":
@@ -95,7 +96,7 @@ class Surroundings:
         """Return the name of the obstacle in a slot, '' for none."""
         return self._slots[slot] if 0 <= slot < len(self._slots) else ""
 
-    def shapes(self) -> list[dict[str, Any]]:
+    def shapes(self) -> list[Json]:
         """Return the obstacles as they were last told."""
         return [thing.shape for thing in self._things.values()]
 
@@ -105,21 +106,21 @@ class Drawing(Surroundings, ABC):
 
     drawn: ClassVar[tuple[str, ...]]  # fields of a record without which nothing can be shown
 
-    def can_show(self, record: Any) -> bool:
+    def can_show(self, record: RecordRow) -> bool:
         """Return whether a record's numbers can be drawn: a log takes whatever bits a tick had."""
         names = record.dtype.names or ()
         return all(name in names and bool((np.abs(record[name]) < BOUND).all()) for name in self.drawn)
 
     @abstractmethod
-    def frames(self, record: Any, ns: int) -> bytes:
+    def frames(self, record: RecordRow, ns: int) -> bytes:
         """Return foxglove.FrameTransforms of what moves at log_time `ns`."""
 
     @abstractmethod
-    def own(self, message: Any, record: Any, ns: int) -> None:
+    def own(self, message: SceneUpdate, record: RecordRow, ns: int) -> None:
         """Add to a SceneUpdate what is drawn beside the obstacles."""
 
     @abstractmethod
-    def body(self, message: Any) -> None:
+    def body(self, message: SceneUpdate) -> None:
         """Add to a SceneUpdate what hangs on the frames and never changes."""
 
     @cached_property
@@ -129,7 +130,7 @@ class Drawing(Surroundings, ABC):
         data: bytes = message.SerializeToString(deterministic=True)
         return data
 
-    def update(self, record: Any, ns: int) -> bytes:
+    def update(self, record: RecordRow, ns: int) -> bytes:
         """Return foxglove.SceneUpdate at log_time `ns`; what was cleared is deleted."""
         message = SceneUpdate()
         for name in self._gone:
@@ -144,14 +145,15 @@ class Drawing(Surroundings, ABC):
         return data
 
 
-def _is_shape(shape: Any) -> bool:
+def _is_shape(shape: object) -> bool:
     """Return whether a shape is one that the controller's table takes: it refuses others, and they are not drawn."""
     return isinstance(shape, dict) and all(_are_numbers(shape.get(name), count) for name, count in NUMBERS)
 
 
-def _are_numbers(values: Any, count: int) -> bool:
-    known = isinstance(values, list) and len(values) == count
-    return known and all(isinstance(v, int | float) and abs(v) <= LARGEST for v in values)
+def _are_numbers(values: object, count: int) -> bool:
+    if not isinstance(values, list) or len(values) != count:
+        return False
+    return all(isinstance(v, int | float) and abs(v) <= LARGEST for v in values)
 
 
 def _boxed(points: F64, radius: float) -> F64:
@@ -167,7 +169,7 @@ def _called(name: str) -> str:
     return f"obstacle {name}"
 
 
-def _json(text: "str | bytes") -> dict[str, Any]:
+def _json(text: "str | bytes") -> Json:
     try:
         value = json.loads(text or "{}")
     except (ValueError, RecursionError):

@@ -4,9 +4,9 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtctl.errors import LogError
 from rtctl.log import schema
@@ -17,6 +17,7 @@ from rtctl.log.mcap.recovery import drop_last_chunk, recover
 from rtctl.log.mcap.segment import CHUNK_BYTES, MODE, Segment, begin, open_name
 from rtctl.log.record.encoding import Encoder
 from rtctl.log.record.retention import Retention, session_order
+from rtctl.plain import Json
 
 CHUNK_TIME = 0.25  # [s] after which a chunk is written however small
 JITTER_NS = 1_000_000  # of the clocks' offset, as it is read: less is no change
@@ -193,7 +194,7 @@ class Session:
         self._written = self.encoder.number
         self.clean = True
 
-    def finish(self, content: Mapping[str, Any]) -> None:
+    def finish(self, content: Json) -> None:
         """Close the current segment, saying why."""
         self.flush()
         if self._segment is None:
@@ -209,7 +210,7 @@ class Session:
             self.degraded = True
             self._finish_short(segment, {**sentinel, "reason": f"disk: {error.strerror}"})
 
-    def _finish_short(self, segment: Segment, content: Mapping[str, Any]) -> None:
+    def _finish_short(self, segment: Segment, content: Json) -> None:
         """Close a segment on a full disk: give up the reserve, then chunk after chunk, until its end fits."""
         segment.close()
         self._give_up_reserve()
@@ -233,7 +234,7 @@ class Session:
         self.finish({"reason": reason})
         self.degraded = True
 
-    def close(self, content: Mapping[str, Any], number: int = 0) -> None:
+    def close(self, content: Json, number: int = 0) -> None:
         """Close the log. number: of the last entry that the producer offered, dropped or not."""
         if self._segment is not None:
             for encoded in self.encoder.missing(number, self.encoder.time):

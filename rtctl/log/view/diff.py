@@ -1,6 +1,6 @@
 """Two runs side by side: what each did, and from where on they differ."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,7 +9,8 @@ from rtctl.log import schema
 from rtctl.log.read.faults import fault_names
 from rtctl.log.read.fields import called, unit_of
 from rtctl.log.read.run import Run
-from rtctl.types import F64, State, Status
+from rtctl.log.read.topic import Topic
+from rtctl.types import F64, Array, State, Status
 
 COMPARED = (
     "q", "qd", "tau_measured", "x", "xd", "wxyz", "goal", "F", "error", "error_rot", "sigma_min", "rho", "tau_motion",
@@ -72,7 +73,7 @@ def diff(a: Run, b: Run) -> Diff:
     return Diff(len(rows), same, summary, tuple(gaps), one.field("time")[rows], tip, error, tau)
 
 
-def _gap(name: str, x: Any, y: Any, time: F64) -> Gap | None:
+def _gap(name: str, x: Array, y: Array, time: F64) -> Gap | None:
     kind = {8: np.uint64, 4: np.uint32}[x.dtype.itemsize]
     bits = (np.ascontiguousarray(x).view(kind) != np.ascontiguousarray(y).view(kind)).reshape(len(x), -1)
     found = np.flatnonzero(bits.any(axis=1))
@@ -85,7 +86,7 @@ def _gap(name: str, x: Any, y: Any, time: F64) -> Gap | None:
     return Gap(name, unit_of(name), len(found), float(time[found[0]]), float(size[k]), float(time[found[k]]))
 
 
-def _figures(run: Run, topic: Any) -> dict[str, str]:
+def _figures(run: Run, topic: Topic) -> dict[str, str]:
     """Return what a run did, as text by name."""
     header = run.header
     time, rho = topic.field("time"), topic.rho
@@ -113,7 +114,7 @@ def _figures(run: Run, topic: Any) -> dict[str, str]:
     }
 
 
-def _turns(values: Any) -> list[int]:
+def _turns(values: Array) -> list[int]:
     """Return the values of a sequence without repetitions of neighbours."""
     v = np.asarray(values)
     keep = np.concatenate([[True], v[1:] != v[:-1]])

@@ -3,9 +3,9 @@
 import contextlib
 import csv
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,12 @@ from rtctl.log.read.fields import FIELDS, unit_of
 from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Structured, Topic
 from rtctl.log.view.mavlink import packets
+from rtctl.types import I64
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+T = TypeVar("T")
 Progress = Callable[[int], None]  # told how many messages are done
 _BRS, _ESI = 1, 2  # flags of a candump line of CAN FD
 
@@ -36,7 +41,7 @@ def to_csv(run: Run, topic: str, names: tuple[str, ...], out: IO[str], progress:
         if not _is_array(piece):
             if k == 0:
                 writer.writerow(["log_time_ns", "json"])
-            rows: Any = [
+            rows: Iterable[tuple[object, ...]] = [
                 (at, text.decode("utf-8", "replace"))
                 for at, text in zip(piece.time.tolist(), piece.payloads, strict=True)
             ]
@@ -72,13 +77,12 @@ def _is_array(topic: Topic) -> bool:
 
 def to_parquet(run: Run, topic: str, names: tuple[str, ...], path: Path, progress: Progress) -> int:
     """Write a topic as Parquet: arrays as lists of fixed size, units and meanings as metadata of the columns."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     writer, done = None, 0
     with contextlib.ExitStack() as stack:
         for piece in run.pieces(topic):
-            table = _table(pa, piece, names)
+            table = _table(piece, names)
             if writer is None:
                 writer = stack.enter_context(pq.ParquetWriter(path, table.schema, compression="zstd"))
             writer.write_table(table)
@@ -87,7 +91,9 @@ def to_parquet(run: Run, topic: str, names: tuple[str, ...], path: Path, progres
     return done
 
 
-def _table(pa: Any, piece: Topic, names: tuple[str, ...]) -> Any:
+def _table(piece: Topic, names: tuple[str, ...]) -> "pa.Table":
+    import pyarrow as pa
+
     arrays, fields = [pa.array(piece.time, pa.timestamp("ns"))], [pa.field("log_time", pa.timestamp("ns"))]
     arrays, fields = [*arrays, pa.array(piece.sequence)], [*fields, pa.field("sequence", pa.int64())]
     if not _is_array(piece):
@@ -114,7 +120,7 @@ def buses(run: Run) -> list[str]:
     return found
 
 
-def frames(run: Run) -> Iterator[tuple[str, np.ndarray[Any, Any], Structured]]:
+def frames(run: Run) -> Iterator[tuple[str, I64, Structured]]:
     """Yield (bus, log_time [ns], frames) of all buses, piece by piece."""
     for topic in buses(run):
         for piece in run.pieces(topic):
@@ -131,7 +137,7 @@ def to_candump(run: Run, out: IO[str], progress: Progress) -> int:
     return done
 
 
-def _merged(run: Run, make: Callable[[str, Any, Structured], list[Any]]) -> Iterator[tuple[Any, list[Any]]]:
+def _merged(run: Run, make: Callable[[str, I64, Structured], list[T]]) -> Iterator[tuple[I64, list[T]]]:
     """Yield (times, what `make` gives for each frame); several buses are merged by time."""
     names = buses(run)
     if len(names) == 1:
@@ -147,7 +153,7 @@ def _merged(run: Run, make: Callable[[str, Any, Structured], list[Any]]) -> Iter
     yield every[order], [things[i] for i in order.tolist()]
 
 
-def candump_lines(bus: str, time: Any, array: Structured) -> list[str]:
+def candump_lines(bus: str, time: I64, array: Structured) -> list[str]:
     """Return the line of each frame."""
     us = (time + 500) // 1000
     stamps = zip((us // 1_000_000).tolist(), (us % 1_000_000).tolist(), strict=True)
@@ -171,7 +177,7 @@ def to_blf(run: Run, path: Path, progress: Progress) -> int:
     names = [topic.removeprefix(schema.can_topic("")) for topic in buses(run)]
     done = 0
 
-    def messages(bus: str, time: Any, array: Structured) -> list[Any]:
+    def messages(bus: str, time: I64, array: Structured) -> list[can.Message]:
         found = []
         for at, row in zip(time.tolist(), array, strict=True):
             size = int(row["dlc"])

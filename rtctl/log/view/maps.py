@@ -1,9 +1,9 @@
 """Where the tip went and past what, seen along an axis of the world."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 
@@ -14,7 +14,6 @@ from rtctl.log.view.style import FAINT, INK, PAPER, RED, Goal, frame
 from rtctl.types import F64, Shape
 from rtctl.world.outline import axis_view, outline
 
-Axes = Any  # of matplotlib, which has no types
 Window = tuple[F64, F64]  # corners (3,) [m]
 MARGIN = 0.12  # [m] round path and goals
 NEARBY = 1.0  # [m] an obstacle further from the path need not be on the maps
@@ -74,7 +73,8 @@ def draw_map(
         here, colour = np.array(goal.position)[list(plane)], RED if goal.reached is False else INK
         axes.plot(*here, "o", ms=17, mfc=PAPER, mec=colour, mew=1.8, zorder=8)
         axes.text(
-            *here,
+            here[0],
+            here[1],
             str(goal.number),
             ha="center",
             va="center_baseline",
@@ -97,7 +97,7 @@ def _label(axes: Axes, place: F64, text: str, offset: tuple[int, int], colour: s
     box = {"fc": PAPER, "ec": "none", "alpha": 0.75, "pad": 0.8}
     axes.annotate(
         text,
-        place,
+        (place[0], place[1]),
         xytext=offset,
         textcoords="offset points",
         ha="center",
@@ -111,7 +111,9 @@ def _label(axes: Axes, place: F64, text: str, offset: tuple[int, int], colour: s
 def _fitted(axes: Axes, window: Window, plane: tuple[int, int]) -> Window:
     """Return the window widened, the same on both sides, to the shape of the axes: scales are equal."""
     low, high = window[0].copy(), window[1].copy()
-    size = axes.get_position().size * axes.figure.get_size_inches()
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    size = axes.get_position().size * figure.get_size_inches()
     scale = float(((high - low)[list(plane)] / size).max())
     for axis, length in zip(plane, size, strict=True):
         more = 0.5 * (scale * length - (high[axis] - low[axis]))
@@ -158,8 +160,10 @@ def _obstacle(axes: Axes, g: Gathered, way: Way, colour: str, plane: tuple[int, 
     if moves:  # below, where it hides no goal
         at = np.array([at[0], edge[:, 1].min()])
     box = {"fc": PAPER, "ec": colour, "alpha": 0.85, "pad": 1.6, "lw": 0.8}
+    x, y = np.clip(at, low, high)
     axes.text(
-        *np.clip(at, low, high),
+        x,
+        y,
         f"{way.name} at {time:.1f} s" if moves else way.name,
         ha="center",
         va="center",

@@ -3,14 +3,16 @@
 import base64
 import json
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
+from mcap.records import Schema
 
 from rtctl.errors import LogError
 from rtctl.log.read.run import Run
 
+Sender: TypeAlias = tuple[str, str, int, int]  # link, way, system, component
 V1, V2 = 0xFE, 0xFD  # first byte of a packet
 PREFIX = "/mavlink/"
 
@@ -84,7 +86,7 @@ def _opener(run: Run, topic: str) -> Callable[[bytes], bytes]:
     return lambda payload: payload
 
 
-def _from_protobuf(kind: Any) -> Callable[[bytes], bytes]:
+def _from_protobuf(kind: Schema) -> Callable[[bytes], bytes]:
     try:
         pool = descriptor_pool.DescriptorPool()
         for file in descriptor_pb2.FileDescriptorSet.FromString(kind.data).file:
@@ -114,10 +116,10 @@ def _from_json(payload: bytes) -> bytes:
 def listing(run: Run) -> list[Listing]:
     """Return what was sent on each link, by sender and kind of message."""
     every = packets(run)
-    groups: dict[tuple[Any, ...], list[int]] = {}
-    numbers: dict[tuple[Any, ...], set[int]] = {}
-    lost: dict[tuple[Any, ...], int] = {}
-    last: dict[tuple[Any, ...], int] = {}
+    groups: dict[tuple[str, str, int, int, int], list[int]] = {}
+    numbers: dict[Sender, set[int]] = {}
+    lost: dict[Sender, int] = {}
+    last: dict[Sender, int] = {}
     for p in every:
         sender = (p.link, p.way, p.system, p.component)
         if sender in last:

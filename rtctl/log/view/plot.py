@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rtctl.errors import LogError
 from rtctl.log import schema
@@ -14,6 +15,9 @@ from rtctl.log.view.report.slots import slot_names
 from rtctl.types import F64
 
 BINS = 1500  # across a picture; more samples are drawn as the band between their smallest and largest
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 DPI = 110
 
 
@@ -34,7 +38,7 @@ def envelope(time: F64, values: F64, bins: int = BINS) -> tuple[F64, F64]:
     return np.repeat(time[edges], 2), np.stack([low, high], axis=1).reshape(-1)
 
 
-def figure(rows: int, width: float = 11.0, height: float = 2.2) -> Any:
+def figure(rows: int, width: float = 11.0, height: float = 2.2) -> "tuple[Figure, NDArray[np.object_]]":
     """Return a matplotlib figure and its axes, one below the other."""
     import matplotlib
 
@@ -46,7 +50,7 @@ def figure(rows: int, width: float = 11.0, height: float = 2.2) -> Any:
     )
 
 
-def save(fig: Any, path: Path) -> None:
+def save(fig: "Figure", path: Path) -> None:
     """Write a figure as PNG, SVG or PDF by the name's ending. Raises LogError for another."""
     from matplotlib import pyplot
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -32,7 +33,7 @@ from rtctl.log.view.style import (
 SIZE, DPI = (16.0, 12.0), 100
 COLOURS = 96  # of the file: a third of the bytes of one with all
 REACHED = 5.0  # [mm] drawn as the level below which a goal counts as reached
-Panel = Callable[[Any, Gathered, Notes], None]
+Panel = Callable[[Axes, Gathered, Notes], None]
 
 
 def draw(g: Gathered, path: Path, notes: Notes | None = None) -> None:
@@ -54,7 +55,7 @@ def draw(g: Gathered, path: Path, notes: Notes | None = None) -> None:
             draw_map(figure.add_subplot(places[k]), g, notes.goals, colours, plane, window, title)
     panels = [panel for panel, needs in PANELS if any(name.startswith(needs) for name in g.bins.names)]
     rows = grid[1].subgridspec(len(panels), 1, hspace=0.32)
-    last: Any = None
+    last: Axes | None = None
     for k, panel in enumerate(panels):
         axes = last = figure.add_subplot(rows[k])
         panel(axes, g, notes)
@@ -110,14 +111,14 @@ def _obstacles(g: Gathered) -> list[str]:
     return [*measured, *(way.name for way in g.obstacles if way.name not in measured)]
 
 
-def _line(axes: Any, g: Gathered, name: str, scale: float = 1.0, **how: Any) -> None:
+def _line(axes: Axes, g: Gathered, name: str, scale: float = 1.0, **how: Any) -> None:
     """Draw a series as a line through the smallest and largest value of each bin."""
     low, high = g.bins.series(name)
     time, values = np.repeat(g.bins.time, 2), scale * np.stack([low, high], axis=1).reshape(-1)
     axes.plot(time, values, **{"lw": 1.4, **how})
 
 
-def _instants(axes: Any, g: Gathered, notes: Notes, numbered: bool) -> None:
+def _instants(axes: Axes, g: Gathered, notes: Notes, numbered: bool) -> None:
     """Mark when goals were given, and when faults were in force."""
     axes.set_xlim(float(g.bins.time[0]), max(float(g.bins.time[-1]), float(g.bins.time[0]) + g.header.period))
     for span in g.faults:
@@ -137,7 +138,7 @@ def _instants(axes: Any, g: Gathered, notes: Notes, numbered: bool) -> None:
             )
 
 
-def _error(axes: Any, g: Gathered, notes: Notes) -> None:
+def _error(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the distance to the goal in force."""
     low, high = (np.maximum(series * 1e3, 1e-3) for series in g.bins.series("error"))
     axes.plot(np.repeat(g.bins.time, 2), np.stack([low, high], axis=1).reshape(-1), color=BLUE, lw=1.4)
@@ -148,7 +149,7 @@ def _error(axes: Any, g: Gathered, notes: Notes) -> None:
     head(axes, "Distance to the goal", "mm")
 
 
-def _clearance(axes: Any, g: Gathered, notes: Notes) -> None:
+def _clearance(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the controller's distance to each obstacle; the oracle's smallest is told beside it."""
     oracle = dict(notes.oracle)
     names = [name.removeprefix("rho.") for name in g.bins.names if name.startswith("rho.")]
@@ -176,7 +177,7 @@ def _avoid(g: Gathered) -> tuple[float, float]:
         return 0.0, 0.0
 
 
-def _torque(axes: Any, g: Gathered, notes: Notes) -> None:
+def _torque(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the torque sent to each joint, of its limit where the config states one."""
     largest = g.limits.get("tau_max", np.zeros(0))
     relative = len(largest) == len(g.header.joints) and bool((largest > 0.0).all())
@@ -191,7 +192,7 @@ def _torque(axes: Any, g: Gathered, notes: Notes) -> None:
     legend(axes, min(len(g.header.joints), 8))
 
 
-def _speed(axes: Any, g: Gathered, notes: Notes) -> None:
+def _speed(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the speed of the tip."""
     _line(axes, g, "speed", color=BLUE)
     axes.set_ylim(bottom=0.0)
@@ -202,7 +203,7 @@ def _speed(axes: Any, g: Gathered, notes: Notes) -> None:
     head(axes, "Speed of the tip", "m/s")
 
 
-def _timing(axes: Any, g: Gathered, notes: Notes) -> None:
+def _timing(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the time of each turn; lateness and missed slots where there are deadlines."""
     _line(axes, g, "compute", 1e3, color=ORANGE, lw=1.1, label=f"turn, p99 {g.compute.quantile(0.99) * 1e3:.2f} ms")
     axes.set_yscale("log")

@@ -1,10 +1,11 @@
 """Colours, axes and marks of the picture of a run; the colours of Okabe and Ito, which all people tell apart."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE = (
-    "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
+from matplotlib.axes import Axes
+
+ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
+BLUE, RED, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 INK, FAINT, PAPER = "#222222", "#9A9A9A", "#FFFFFF"
 OBSTACLE_COLOURS = (ORANGE, SKY, GREEN, PURPLE, RED, BLUE, "#8C8C8C", YELLOW)
 JOINT_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, INK)
@@ -30,7 +31,7 @@ class Notes(NamedTuple):
     lockstep: bool = False  # time waited for the drives: there are no deadlines
 
 
-def frame(axes: Any) -> None:
+def frame(axes: Axes) -> None:
     """Leave two sides of a frame."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -41,14 +42,14 @@ def frame(axes: Any) -> None:
     axes.set_axisbelow(True)
 
 
-def head(axes: Any, title: str, unit: str) -> None:
+def head(axes: Axes, title: str, unit: str) -> None:
     """Name a panel and its unit."""
     axes.set_title(f"{title} [{unit}]", loc="left", fontsize=11.5, fontweight="bold", color=INK, pad=5)
     axes.grid(axis="y", color="#ECECEC", lw=0.8)
     frame(axes)
 
 
-def level(axes: Any, value: float, text: str, colour: str) -> None:
+def level(axes: Axes, value: float, text: str, colour: str) -> None:
     """Draw a level and name it at the right end of the axes."""
     axes.axhline(value, color=colour, lw=1.2, ls="--")
     box = {"fc": PAPER, "ec": "none", "alpha": 0.8, "pad": 0.6}
@@ -67,7 +68,7 @@ def level(axes: Any, value: float, text: str, colour: str) -> None:
     )
 
 
-def legend(axes: Any, columns: int) -> None:
+def legend(axes: Axes, columns: int) -> None:
     """Put the names of the lines above the axes, at the right."""
     axes.legend(
         loc="lower right",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,13 @@ from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Structured
 from rtctl.log.view.export import frames
 from rtctl.protocol.dbc import DBC
-from rtctl.types import F64, I64
+from rtctl.types import F64, I64, U8
 
 COUNTER_AT = 8  # of the counter in a protected frame of 12 bytes
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+    from cantools.database.can import Signal as DbcSignal
 
 
 class Signal(NamedTuple):
@@ -87,7 +91,7 @@ def _has_header(run: Run) -> bool:
         return False
 
 
-def _messages(text: str) -> dict[int, Any]:
+def _messages(text: str) -> "dict[int, Message]":
     """Return a DBC's messages by identifier. Raises LogError when it is none."""
     if not text:
         return {}
@@ -108,7 +112,7 @@ def load_dbc(path: Path) -> str:
         raise LogError(f"{path}: {error.strerror}") from None
 
 
-def _add(s: _Sum, time: I64, array: Structured, counted: bool, messages: Mapping[int, Any]) -> None:
+def _add(s: _Sum, time: I64, array: Structured, counted: bool, messages: "Mapping[int, Message]") -> None:
     data = array["data"]
     before = s.tail[None, :] if s.frames else data[:1]
     s.changes += int((data != np.concatenate([before, data[:-1]])).any(axis=1).sum())
@@ -127,7 +131,7 @@ def _add(s: _Sum, time: I64, array: Structured, counted: bool, messages: Mapping
         _decode(s, data[:, : s.length], message)
 
 
-def _decode(s: _Sum, data: np.ndarray[Any, Any], message: Any) -> None:
+def _decode(s: _Sum, data: U8, message: "Message") -> None:
     special = (data[:, :7] == 0xFF).all(axis=1)  # enable, disable and the like are no numbers
     if special.all():
         return
@@ -139,7 +143,7 @@ def _decode(s: _Sum, data: np.ndarray[Any, Any], message: Any) -> None:
     s.values = values[-1]
 
 
-def _values(bits: np.ndarray[Any, Any], signal: Any) -> F64:
+def _values(bits: U8, signal: "DbcSignal") -> F64:
     """Return a signal of every frame. bits: (N, 8 length), the most significant bit of each byte first."""
     if signal.byte_order == "big_endian":
         start = 8 * (signal.start // 8) + 7 - signal.start % 8
@@ -153,7 +157,7 @@ def _values(bits: np.ndarray[Any, Any], signal: Any) -> F64:
     return np.asarray(raw * float(signal.scale) + float(signal.offset))
 
 
-def _row(key: tuple[str, int, int], s: _Sum, counted: bool, messages: Mapping[int, Any]) -> Traffic:
+def _row(key: tuple[str, int, int], s: _Sum, counted: bool, messages: "Mapping[int, Message]") -> Traffic:
     bus, number, way = key
     message = messages.get(number)
     signals: tuple[Signal, ...] = ()
@@ -188,6 +192,6 @@ def _row(key: tuple[str, int, int], s: _Sum, counted: bool, messages: Mapping[in
     )
 
 
-def _choice(signal: Any, value: float) -> str:
-    found = (signal.choices or {}).get(round(value)) if signal.choices else None
+def _choice(signal: "DbcSignal", value: float) -> str:
+    found = signal.choices.get(round(value)) if signal.choices else None
     return str(found) if found is not None else ""

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,9 @@ from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Part, Structured
 from rtctl.log.view.report.bins import Bins, Histogram, Spectrum
 from rtctl.log.view.report.slots import Slots, Way
+from rtctl.plain import Json
 from rtctl.spec.bus import frame_time
-from rtctl.types import F64, Cut, State, Status
+from rtctl.types import F64, Array, Cut, State, Status
 
 XYZ = ("x", "y", "z")
 PARTS = ("motion", "obstacles", "limits", "posture", "gravity")
@@ -46,7 +47,7 @@ class Gathered(NamedTuple):
     goals: list[list[float]]  # [m] as they were asked for
     asked: list[float]  # [s] when
     limits: dict[str, F64]  # q_min, q_max, tau_max, qd_max (n,), v_max (1,)
-    figures: dict[str, Any]
+    figures: Json
     bus: dict[str, tuple[F64, F64]]  # topic -> times [s] and load [0..1]
     events: list[tuple[float, str, str]]
 
@@ -60,7 +61,7 @@ class _Turns:
         self._value: int | None = None
         self._since = self._last = 0.0
 
-    def add(self, time: F64, values: np.ndarray[Any, Any]) -> None:
+    def add(self, time: F64, values: Array) -> None:
         if not len(values):
             return
         previous = -1 if self._value is None else self._value
@@ -85,7 +86,7 @@ class _Bits:
     def __init__(self, names: dict[int, str]) -> None:
         self._turns = {bit: _Turns(lambda v, name=name: name if v else "") for bit, name in names.items()}  # type: ignore[misc]
 
-    def add(self, time: F64, values: np.ndarray[Any, Any]) -> None:
+    def add(self, time: F64, values: Array) -> None:
         for bit, turns in self._turns.items():
             turns.add(time, (values & np.array(bit, values.dtype)) != 0)
 
@@ -204,7 +205,7 @@ class _Figures:
             self.torque = max(self.torque, float(np.abs(r["tau_sent"]).max()))
         self.rho = min(self.rho, float(r["rho"].min()))
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         return {
             "ticks": self.ticks,
             "missed": self.missed,
@@ -258,7 +259,7 @@ def _bus_load(run: Run, topic: str, header: Header, width: float = 0.1) -> tuple
     return np.asarray(np.arange(count) * width), load / width
 
 
-def _event(event: dict[str, Any]) -> tuple[float, str, str]:
+def _event(event: Json) -> tuple[float, str, str]:
     at = event.get("time", 0.0)
     return (
         float(at) if isinstance(at, int | float) else 0.0,

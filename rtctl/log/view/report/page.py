@@ -7,13 +7,14 @@ import math
 import zlib
 from functools import cache
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
 from rtctl.log.read.fields import unit_of
 from rtctl.log.read.run import Run
+from rtctl.log.view.report.bins import Histogram
 from rtctl.log.view.report.gather import PARTS, XYZ, Gathered, Span
+from rtctl.plain import Json
 from rtctl.types import F64
 
 LEVELS = 65534  # of a packed value between a series' smallest and largest; 65535 is no number
@@ -55,7 +56,7 @@ def page(run: Run, g: Gathered) -> str:
     return text
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """Return plain values with null for what JSON has no number for."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -75,7 +76,7 @@ class _Pack:
     """All series as 16-bit numbers, one behind the other, and where each is."""
 
     def __init__(self, g: Gathered) -> None:
-        self.index: dict[str, Any] = {"time": _r(g.bins.time, 5), "series": {}}
+        self.index: Json = {"time": _r(g.bins.time, 5), "series": {}}
         parts = []
         for k, name in enumerate(g.bins.names):
             low, high = g.bins.series(name)
@@ -89,13 +90,13 @@ class _Pack:
         self.bytes = b"".join(parts)
 
 
-def plots(g: Gathered) -> list[dict[str, Any]]:
+def plots(g: Gathered) -> list[Json]:
     """Return the plots in order: title, unit, series [(name, label, colour index, dashed)], limits."""
     have = set(g.bins.names)
     joints = g.header.joints
     found = []
 
-    def plot(key: str, title: str, unit: str, series: list[tuple[str, str, int, bool]], **more: Any) -> None:
+    def plot(key: str, title: str, unit: str, series: list[tuple[str, str, int, bool]], **more: object) -> None:
         mine = [s for s in series if s[0] in have]
         if mine:
             found.append({"id": key, "title": title, "unit": unit, "series": mine, **more})
@@ -190,7 +191,7 @@ def _r(values: F64, digits: int = 6) -> list[float | None]:
     return [float(f"{v:.{digits}g}") if math.isfinite(v) else None for v in values.tolist()]
 
 
-def _spans(spans: list[Span]) -> list[list[Any]]:
+def _spans(spans: list[Span]) -> list[list[float | str]]:
     return [[round(s.start, 4), round(s.stop, 4), s.name] for s in spans[:SPANS_MAX]]
 
 
@@ -199,7 +200,7 @@ def _thinned(path: list[list[float]], most: int = 200) -> list[list[float]]:
     return path[::step] + ([path[-1]] if (len(path) - 1) % step else [])
 
 
-def _tip(g: Gathered) -> dict[str, Any]:
+def _tip(g: Gathered) -> Json:
     if not {"x.x", "x.y", "x.z"} <= set(g.bins.names):
         return {"path": [], "goals": []}
     step = max(1, len(g.bins.time) // TIP_POINTS)
@@ -211,14 +212,14 @@ def _tip(g: Gathered) -> dict[str, Any]:
     return {"path": [r for r in rows if all(math.isfinite(v) for v in r)], "goals": g.goals[:200]}
 
 
-def _spectrum(g: Gathered) -> dict[str, Any]:
+def _spectrum(g: Gathered) -> Json:
     if not g.spectrum.blocks:
         return {}
     rows = {joint: _r(a[1:], 4) for joint, a in zip(g.header.joints, g.spectrum.amplitude, strict=True)}
     return {"f": _r(g.spectrum.frequency[1:], 5), "rows": rows}
 
 
-def _histogram(h: Any) -> dict[str, Any]:
+def _histogram(h: Histogram) -> Json:
     return {"edges": _r(h.edges, 4), "counts": h.counts.tolist()}
 
 

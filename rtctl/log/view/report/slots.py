@@ -1,15 +1,15 @@
 """Which obstacle was in which slot, and where: from the config and the requests of a log."""
 
 import math
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from rtctl.log import schema
 from rtctl.log.header import Header
 from rtctl.log.read.run import Run
 from rtctl.log.record.encoding import event_of
 from rtctl.log.record.surroundings import Surroundings
+from rtctl.plain import Json
+from rtctl.types import B1, I64
 
 
 class Way(NamedTuple):
@@ -55,7 +55,7 @@ class Slots:
                     self.owner.setdefault(slot, []).append((tick, name))
                     previous[slot] = name
 
-    def _aimed(self, goal: dict[str, Any], tick: int) -> None:
+    def _aimed(self, goal: Json, tick: int) -> None:
         try:
             x, y, z = (round(float(v), 4) for v in goal["position"])
         except (KeyError, TypeError, ValueError):
@@ -64,7 +64,7 @@ class Slots:
             self.goals.append([x, y, z])
             self.asked.append(tick)
 
-    def _seen(self, shape: dict[str, Any], tick: int) -> None:
+    def _seen(self, shape: Json, tick: int) -> None:
         try:
             name, p = str(shape["name"]), [round(float(v), 4) for v in shape["position"]]
             dims, wxyz = [float(v) for v in shape["dims"]], [float(v) for v in shape["wxyz"]]
@@ -77,7 +77,7 @@ class Slots:
             ticks.append(tick)
         self.ways[name] = Way(name, str(shape.get("type", "")), dims, path, wxyz, ticks)
 
-    def mine(self, slot: int, tick: np.ndarray[Any, Any]) -> "list[tuple[str, np.ndarray[Any, Any]]]":
+    def mine(self, slot: int, tick: I64) -> "list[tuple[str, B1]]":
         """Return by name the rows in which that obstacle had the slot."""
         rows = self.owner.get(slot, [(-1, f"slot {slot}")])
         found = []

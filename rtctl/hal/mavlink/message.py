@@ -1,0 +1,18 @@
+"""A MAVLink message as pymavlink decodes it: one class per message, with a field per attribute."""
+
+from typing import Any, Protocol
+
+
+class Message(Protocol):
+    """What all of pymavlink's messages have in common."""
+
+    crc_extra: int
+
+    def get_type(self) -> str:
+        """Return the name of the message's kind."""
+
+    def pack(self, mav: object) -> bytes:
+        """Return the frame, numbered by the sender `mav`."""
+
+    def __getattr__(self, field: str) -> Any:
+        """Return a field of the message."""
