@@ -109,6 +109,8 @@ def _task(status: dict[str, Any]) -> Table:
         if task in ("", "position", "pose")
         else f"{task} of {_vector(goal)} m"
     )
+    heading = status.get("goal_heading_rad")
+    aim += "" if heading is None else f", heading {math.degrees(heading):+.0f} deg"
     table.add_row("goal", aim, "tick", loop)
     table.add_row("error", error, "wake", late)
     return table
