@@ -8,6 +8,8 @@ import subprocess
 import sys
 from contextlib import suppress
 
+import pytest
+
 from rtctl import cli
 from rtctl.errors import EXIT_OK, RequestError
 from rtctl.hal.client import demand
@@ -115,9 +117,11 @@ def test_a_base_is_armed_driven_by_metres_and_degrees_and_let_go_at_rest(tmp_pat
         daemon = pair.daemon()
         assert not pair.truth()["armed"]
         pair.goal("3", "0.5", "0")
-        pair.goal("--latlon", "-35.363262", "149.165281")  # 4 m east of the origin
+        pair.goal("--latlon", "-35.363262", "149.165281", "--heading", "1.5")  # 4 m east of the origin, to the north
         assert sum(json.loads(line)["arrived"] for line in capsys.readouterr().out.splitlines()) == 2
         assert abs(pair.ask("status")["x_m"][0] - 4.0) < 0.4
+        assert pair.ask("status")["goal_heading_rad"] == pytest.approx(1.5)
+        assert abs(pair.truth()["yaw_rad"] - 1.5) < 0.15
         assert cli.main(["goal", "1", "0", "0", "--rpy", "0", "0", "1", "--socket", pair.console]) != EXIT_OK
         assert "orientation" in capsys.readouterr().err
         daemon.send_signal(signal.SIGTERM)

@@ -247,6 +247,12 @@ def test_a_goal_reaches_the_tick_as_it_was_typed(arm: Arm) -> None:
     assert goal.tolerance == 0.01
 
 
+def test_a_heading_is_a_bases_and_an_arm_says_what_it_takes_instead(arm: Arm, capsys: Said) -> None:
+    assert main(["goal", "0.3", "0", "0.5", "--heading", "1.5"]) == EXIT_FAILED
+    assert "goal.heading_rad: got 1.5, wanted rpy_rad or wxyz" in capsys.readouterr().err
+    assert not arm.requests
+
+
 def test_hold_orientation_asks_for_the_present_one(arm: Arm) -> None:
     assert main(["goal", "0.3", "0", "0.5", "--hold-orientation"]) == EXIT_OK
     goal = arm.requests[0].goal

@@ -204,4 +204,8 @@ def scenario_robot(robot: Robot, scenario: Scenario, path: Path) -> Robot:
     start = scenario.start_q_rad
     if start is not None and len(start) != robot.n:
         raise ConfigError(f"{path}: start_q_rad", f"{len(start)} angles", f"{robot.n}, one a joint of {robot.name}")
+    for k, goal in enumerate(scenario.goal):
+        if goal.heading_rad is not None:
+            place = f"{path}: goal[{k}].heading_rad"
+            raise ConfigError(place, f"{goal.heading_rad:g}", "rpy_rad or wxyz: an arm has no heading")
     return robot._replace(meshes=load_assets((), scenario.obstacle, path, robot.meshes).meshes)

@@ -19,7 +19,7 @@ from rtctl.hal.messages import Bounds
 from rtctl.hal.service import bus_resource
 from rtctl.log.entry import Kind
 from rtctl.plain import Json
-from rtctl.rover import faults
+from rtctl.rover import faults, turn
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.pipe import initial, tick, warm
 from rtctl.rover.robot import Base
@@ -32,7 +32,6 @@ MAV_TX, MAV_RX = int(Kind.MAV_TX), int(Kind.MAV_RX)
 ZERO_TWIST_TIME = 3.0  # [s] of zero twist at most, when a turn raised
 REST_SPEED = 0.1  # [m/s]
 WORDS = 5  # of the vehicle, the newest, that `rtctl status` shows
-ANGLE_TOLERANCE = 3.2  # [rad] a base's goals have no orientation
 
 
 def load(path: Path, timeout: float | None = None) -> Setup[Base, BaseMemory, BaseFeedback, BaseCommand]:
@@ -110,7 +109,8 @@ def _numbers(fresh: int, m: BaseMemory) -> str:
 def bounds(base: Base, link: Radio) -> Bounds:
     """Return what goals are held to; places in latitude and longitude go through the vehicle's origin."""
     local = link.local if isinstance(link, RoverLink) else None
-    return Bounds((0.0, 0.0, 0.0), base.reach, base.tolerance, ANGLE_TOLERANCE, Task.X | Task.Y, local)
+    axes = Task.X | Task.Y | Task.ORIENTATION  # the tick says which of them it cannot take
+    return Bounds((0.0, 0.0, 0.0), base.reach, base.tolerance, base.tolerance_rot, axes, local)
 
 
 def status(base: Base, m: BaseMemory, link: Radio, said: Sequence[Said]) -> Json:
@@ -124,7 +124,8 @@ def status(base: Base, m: BaseMemory, link: Radio, said: Sequence[Said]) -> Json
         "speed_m_s": float(np.hypot(*m.here.v)),
         "goal_m": None if goal is None else goal.position,
         "error_m": None if goal is None else float(np.hypot(*(goal.position[:2] - m.here.x))),
-        "error_rad": None,
+        "goal_heading_rad": None if goal is None else _finite(turn.heading_of(goal)),
+        "error_rad": None if goal is None or not goal.task & Task.RZ else abs(turn.left(goal, m.here.yaw)),
         "way_m": float(m.way.length) if np.isfinite(m.way.length) else None,
         "clearance_m": {**seen, **clearances(m)},
         "vehicle": {**_autopilot(m.last, link), "words": _words(said)},

@@ -13,12 +13,13 @@ from rtctl.app.vehicle import Said, Turn
 from rtctl.errors import ConfigError
 from rtctl.hal.mavlink.wire import InProcess
 from rtctl.plain import Json
+from rtctl.rover import turn
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.robot import Base
 from rtctl.rover.signals import BaseCommand, BaseFeedback
 from rtctl.spec.base import BaseConfig
 from rtctl.spec.scenario import Scenario, goal_of
-from rtctl.types import F64, Goal, Request, State, Verb
+from rtctl.types import F64, Goal, Request, State, Task, Verb
 
 RoverTurn: TypeAlias = Turn[BaseFeedback, BaseCommand]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -36,6 +37,8 @@ class RoverTruth(Protocol):
     def y(self) -> float: ...  # [m] north
     @property
     def v(self) -> float: ...  # [m/s]
+    @property
+    def yaw(self) -> float: ...  # [rad]
     @property
     def clearance(self) -> dict[str, float]: ...  # [m] of the outline, by obstacle
     @property
@@ -69,17 +72,26 @@ class RoverTally:
         for name, d in truth.clearance.items():
             self.clearance[name] = min(d, self.clearance.get(name, np.inf))
         if self.legs:
-            self.legs[-1] = _advanced(self.legs[-1], at, truth.time)
+            self.legs[-1] = _advanced(self.legs[-1], at, truth.yaw, truth.time)
 
     def figures(self) -> Json:
         """Return the figures under their published names."""
-        return of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=False)
+        return of_way(
+            self.legs,
+            self.path,
+            self.speed,
+            self.clearance,
+            self.contacts,
+            turned=any(leg.goal.task & Task.RZ for leg in self.legs),
+        )
 
 
-def _advanced(leg: Leg, at: F64, now: float) -> Leg:
+def _advanced(leg: Leg, at: F64, yaw: float, now: float) -> Leg:
     along = leg.goal.position[:2] - leg.start
     e = float(np.hypot(*(leg.goal.position[:2] - at)))
-    return leg.advanced(now, e <= leg.goal.tolerance, along, at - leg.start, e)
+    turned = abs(turn.left(leg.goal, yaw))
+    there = e <= leg.goal.tolerance and turned <= leg.goal.tolerance_rot
+    return leg.advanced(now, there, along, at - leg.start, e, turned)
 
 
 class RoverFeed:
@@ -98,7 +110,7 @@ class RoverFeed:
         verb = Verb.ARM if m.state == State.IDLE and m.tick < 0 else Verb.NONE
         goal = None
         if self.pending and truth.time >= self.pending[0].at_s and m.state == State.RUN:
-            goal = goal_of(self.pending.pop(0), UPRIGHT, self.base.tolerance, 0.1)
+            goal = goal_of(self.pending.pop(0), UPRIGHT, self.base.tolerance, self.base.tolerance_rot)
             self.waiting = (goal, truth.time, np.array([truth.x, truth.y]))
         return Request(verb, goal)
 

@@ -61,6 +61,7 @@ def add(commands: Commands) -> None:
     turn.add_argument("--wxyz", metavar=("W", "X", "Y", "Z"), nargs=4, type=number, help="unit quaternion")
     turn.add_argument("--hold-orientation", action="store_true", help="keep the present orientation")
     turn.add_argument("--direction", metavar=("X", "Y", "Z"), nargs=3, type=number, help="where the tool's axis points")
+    turn.add_argument("--heading", metavar="RAD", type=number, help="of a base, counter-clockwise from east [rad]")
     goal.add_argument("--tool-axis", metavar="AXIS", help="that axis of the tip: x y z -x -y -z (z)")
     goal.add_argument("--axes", metavar="AXES", help="of X Y Z those that count: xy, z, …; none: orientation alone")
     goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
@@ -69,7 +70,8 @@ def add(commands: Commands) -> None:
     goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
-        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, lat,lon, tool_axis, axes, tolerance_m); or JSON:\n"
+        "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, lat,lon, heading_rad, tool_axis, axes,\n"
+        "tolerance_m); or JSON:\n"
         '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.\n'
         "Of a base also a mission of QGroundControl, .plan or .waypoints, of way-points alone."
     )
@@ -216,6 +218,7 @@ def _goal(arguments: argparse.Namespace) -> int:
         "rpy_rad": arguments.rpy,
         "wxyz": arguments.wxyz,
         "direction": arguments.direction,
+        "heading_rad": arguments.heading,
         "tool_axis": arguments.tool_axis,
         "tolerance_m": arguments.tolerance,
     }

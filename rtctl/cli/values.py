@@ -16,7 +16,7 @@ GROUPS = {
     "direction": ("dx", "dy", "dz"),
     "latlon_deg": ("lat", "lon"),
 }
-SINGLE = ("tolerance_m", "tolerance_rad")
+SINGLE = ("heading_rad", "tolerance_m", "tolerance_rad")
 WORDS = ("axes", "tool_axis")
 KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE + WORDS
 NEEDED = (*GROUPS, "hold")  # one of them: where to go

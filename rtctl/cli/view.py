@@ -110,6 +110,8 @@ def _task(status: Json) -> Table:
         if task in ("", "position", "pose")
         else f"{task} of {_vector(goal)} m"
     )
+    heading = status.get("goal_heading_rad")
+    aim += "" if heading is None else f", heading {math.degrees(heading):+.0f} deg"
     table.add_row("goal", aim, "tick", loop)
     table.add_row("error", error, "wake", late)
     return table

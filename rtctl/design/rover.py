@@ -72,6 +72,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         meshes=assets.meshes,
         reach=b.reach_m,
         tolerance=m.tolerance_m,
+        tolerance_rot=m.tolerance_rad,
         stall=s.stall_s,
         engage=s.engage_s,
         sense=a.range_m,

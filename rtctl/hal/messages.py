@@ -17,7 +17,7 @@ from msgspec import Meta, Struct
 from rtctl.arm.task import point_of, within
 from rtctl.errors import RequestError
 from rtctl.plain import Json
-from rtctl.spec.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
+from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
 from rtctl.spec.obstacles import Cloud, Mesh, Name, Obstacle, Orientation, Place, RollPitchYaw, contradiction, shape_of
 from rtctl.spec.robot import Angles
 from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
@@ -25,6 +25,7 @@ from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
 OBSTACLES_MAX = 64  # in one camera frame
 CLOUD_MARK = b"RTCLOUD1"
 _LENGTH = struct.Struct("<I")
+HEADING = "a heading is a base's"
 ARM_TOLERANCE = 0.1  # [m] of an arm's goal at most
 
 Latitude = Annotated[float, Meta(ge=-85.0, le=85.0)]
@@ -83,6 +84,7 @@ class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
     hold: Literal["orientation"] | None = None
     direction: Direction | None = None
     tool_axis: ToolAxis | None = None
+    heading_rad: Heading | None = None  # of a base
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=10.0)] | None = None  # of an arm at most 0.1
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
     posture_rad: Angles | None = None
@@ -266,6 +268,8 @@ def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Seq
         message = msgspec.structs.replace(message, position_m=_position_of(message, bounds), latlon_deg=None)
     if bounds.local is None and (message.tolerance_m or 0.0) > ARM_TOLERANCE:
         raise RequestError(f"goal.tolerance_m: got {message.tolerance_m}, wanted at most {ARM_TOLERANCE}")
+    if bounds.local is None and message.heading_rad is not None:
+        raise RequestError(f"goal.heading_rad: got {message.heading_rad}, wanted rpy_rad or wxyz: {HEADING}")
     if found := goal_contradiction(message):
         key, got, wanted = found
         raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")

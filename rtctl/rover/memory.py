@@ -41,6 +41,7 @@ class BaseMemory(NamedTuple):
     goal_rho: F64  # (K,)
     status: Status
     blocker: int
+    turn: float  # [rad] heading that is turned to on the spot, NaN: none
     nearest: float  # [m] least length of way to the goal so far
     still: int  # ticks since that became less
     # world

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from rtctl.kernel import reductions as scans
-from rtctl.rover import estimator, law, occupancy, path
+from rtctl.rover import estimator, law, occupancy, path, turn
 from rtctl.rover.faults import BIT, FAULTS, Counters, severity
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.record import make_base_record
@@ -27,6 +27,7 @@ BLIND_TIME = 0.5  # [s] before that is a status
 SMOOTH = 1.0  # [s] over which asked and done are compared
 ASKED = np.array([0.3, 0.3])  # [m/s, rad/s] that must be asked for before it is asked what came of it
 LITTLE = 0.4  # of it
+TURN_SPEED = 0.05  # [m/s] of v_ref below which the base turns on the spot
 PROGRESS = 0.3  # [m] by which the way must become shorter to count
 SIGHTLESS = BIT["scan_stale"] | BIT["scan_wrong"]
 Judged = tuple[F64, law.Push, F64, float]  # v_ref wanted, field, xd_d, allowed speed
@@ -82,6 +83,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         goal_rho=far,
         status=Status.NO_GOAL,
         blocker=-1,
+        turn=math.nan,
         nearest=np.inf,
         still=0,
         world=table,
@@ -203,7 +205,9 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
         m = m._replace(way=kept, due=m.due if len(kept.corners) else m.tick + 1)
     whole = m.way.length + m.way.short
     gained = whole < m.nearest - PROGRESS
-    return m._replace(nearest=whole if gained else m.nearest, still=0 if gained else m.still + 1)
+    heading = turn.wanted(base, m)
+    busy = gained or not math.isnan(heading)
+    return m._replace(nearest=whole if gained else m.nearest, still=0 if busy else m.still + 1, turn=heading)
 
 
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
@@ -214,8 +218,9 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     moves = driving(m) and m.state == State.RUN and severity(m.in_force) < Severity.SS2
     xd_d, total = np.zeros(2), np.zeros(2)
     if moves:
-        total = push.seen + push.told.sum(axis=0)
-        if m.goal is not None and m.status != Status.ARRIVED and len(m.way.corners):
+        rests = m.status == Status.ARRIVED or not math.isnan(m.turn)
+        total = _pushed(base, push, rests)
+        if m.goal is not None and not rests and len(m.way.corners):
             way = path.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
             way = way if len(way.corners) else m.way  # from where it will be no corner is in sight: head on
             xd_d = law.desired(base, x, way.corners[0], way.length)
@@ -237,6 +242,17 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     waits = speed > 0.05 and by_sight < min(BLIND_SPEED, allowed)
     m = m._replace(rho=push.rho, rho_seen=push.rho_seen, allowed_seen=by_sight, blind=m.blind + 1 if waits else 0)
     return m, (v_ref, push, xd_d, min(allowed, by_sight))
+
+
+def _pushed(base: Base, push: law.Push, rests: bool) -> F64:
+    """Return the push (2,) [m/s2] of all that is near.
+
+    A base that rests at its goal stays there: it gives way to what comes, or is nearer than rho_min, alone.
+    """
+    told = np.where(((push.closing > 0.0) | (push.rho < base.field.rho_min))[:, None] | (not rests), push.told, 0.0)
+    seen = push.seen if not rests or push.rho_seen < base.field.rho_min else np.zeros(2)
+    total: F64 = seen + told.sum(axis=0)
+    return total
 
 
 def _calm(f: BaseFeedback) -> float:
@@ -285,6 +301,9 @@ def _commanded(
         velocity = v_ref * min(1.0, allowed / speed) if speed > 1e-6 else np.zeros(2)
         v, w = law.unicycle(base, v_ref, _ahead(base, m)[1])
         v = math.copysign(min(abs(v), allowed), v)
+        if m.goal is not None and not math.isnan(m.turn) and speed < TURN_SPEED:
+            angle = turn.left(m.goal, _ahead(base, m)[1])
+            v, w, velocity = 0.0, turn.rate(base, angle, m.goal.tolerance_rot), np.zeros(2)
         if m.state == State.RUN:
             v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
             w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
@@ -313,8 +332,11 @@ def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
     if m.goal is None or m.state != State.RUN:
         return m._replace(status=Status.NO_GOAL, blocker=-1)
     error = float(np.hypot(*(m.goal.position[:2] - m.here.x)))
-    bound = m.goal.tolerance * (2.0 if m.status == Status.ARRIVED else 1.0)
-    if error <= bound and (m.status == Status.ARRIVED or math.hypot(*m.here.v) < 0.3):
+    more = 2.0 if m.status == Status.ARRIVED else 1.0
+    there = error <= more * m.goal.tolerance
+    there = there and abs(turn.left(m.goal, m.here.yaw)) <= more * m.goal.tolerance_rot
+    moves = math.hypot(*m.here.v) >= 0.3 or (turn.heading_of(m.goal) == m.turn and abs(m.here.yaw_rate) >= 0.1)
+    if there and (m.status == Status.ARRIVED or not moves):
         return m._replace(status=Status.ARRIVED, blocker=-1, still=0)
     if (m.blind * base.dt >= BLIND_TIME or m.in_force & SIGHTLESS) and math.hypot(*m.here.v) < 0.2:
         return m._replace(status=Status.BLIND, blocker=-1)
@@ -384,7 +406,9 @@ def _record(
         heading=m.here.yaw,
         innovation=m.innovation,
         goal=goal,
+        goal_heading=math.nan if m.goal is None else turn.heading_of(m.goal),
         error=float(np.hypot(*(goal[:2] - m.here.x))),
+        error_rot=0.0 if m.goal is None else turn.left(m.goal, m.here.yaw),
         way=corners,
         corners=len(m.way.corners),
         way_length=m.way.length,
@@ -434,7 +458,7 @@ def warm(base: Base) -> None:
     far, upright = np.array([0.0, 0.0, 50.0]), np.array([1.0, 0.0, 0.0, 0.0])
     shape = Shape("warm", "sphere", np.array([0.1, 0.1, 0.1, 2.0]), far, upright, np.ones(3), np.zeros(3))
     m = initial(base, f)._replace(state=State.RUN, entered=True, mine=True, v_ref=np.ones(2))
-    goal = Goal(np.array([12.0, 1.0, 0.0]), upright, Task.POSITION, base.tolerance, 0.1)
+    goal = Goal(np.array([12.0, 1.0, 0.0]), upright, Task.POSITION, base.tolerance, base.tolerance_rot)
     for _ in range(3):
         m, _, _ = tick(base, m, f, Request(goal=goal, obstacles=(ObstacleEdit("warm", shape),)))
         f = f._replace(slot=f.slot + 1)

@@ -31,7 +31,8 @@ def base_dtype(slots: int) -> "np.dtype[np.void]":
             ("ours", u), ("mode", u), ("armed", u), ("reboots", u), ("healthy", u), ("word", i),
             ("lost", u), ("refused", u), ("verb", u), ("lateness", f), ("compute", f),
             # estimate and task
-            ("x", f, (3,)), ("xd", f, (3,)), ("heading", f), ("innovation", f), ("goal", f, (3,)), ("error", f),
+            ("x", f, (3,)), ("xd", f, (3,)), ("heading", f), ("innovation", f), ("goal", f, (3,)), ("goal_heading", f),
+            ("error", f), ("error_rot", f),
             ("way", f, (CORNERS, 2)), ("corners", i), ("way_length", f), ("way_short", f),
             # obstacles
             ("rho", f, (slots,)), ("push_told", f, (slots, 2)), ("rho_seen", f), ("push_seen", f, (2,)),

@@ -86,6 +86,7 @@ class Base(NamedTuple):
     meshes: Meshes  # that obstacles may refer to
     reach: float  # [m] no goal further from where the autopilot's frame begins is taken
     tolerance: float  # [m] of a goal that gives none
+    tolerance_rot: float  # [rad] of its heading
     stall: float  # [s] without progress short of the goal before it is diagnosed
     engage: float  # [s] for mode and arming, then the request is given up
     sense: float  # [m] that a scan is believed up to

@@ -7,7 +7,7 @@ import numpy as np
 from rtctl.control import goals
 from rtctl.control.supervisor import Asked, Event, Rules, Session, supervisor_step
 from rtctl.kernel import reductions
-from rtctl.rover import faults, path
+from rtctl.rover import faults, path, turn
 from rtctl.rover.faults import BIT, Evidence
 from rtctl.rover.memory import BaseMemory
 from rtctl.rover.robot import Base
@@ -111,6 +111,7 @@ def _entered(m: BaseMemory) -> BaseMemory:
         goal=None,
         status=Status.NO_GOAL,
         blocker=-1,
+        turn=math.nan,
         still=0,
         off=False,
         held=False,
@@ -133,8 +134,9 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
         return m
     rho = m.goal_rho
     verdict = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
-    if not verdict and goal.task not in (Task.POSITION, Task.X | Task.Y):
-        verdict = "goal: a base takes a position alone, wanted x and y and no orientation"
+    if not verdict and goal.task & Task.POSITION not in (Task.POSITION, Task.X | Task.Y):
+        verdict = "goal: a base goes to a place, wanted x and y"
+    verdict = verdict or turn.refusal(base, goal)
     if not verdict:
         rho = goal_distance(base, m.world, goal)
         verdict = goals.refusal(goal, np.zeros(3), base.reach, rho, m.world.names)
@@ -145,6 +147,7 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
         goal_rho=rho,
         status=Status.MOVING,
         blocker=-1,
+        turn=math.nan,
         still=0,
         way=path.NO_WAY,
         nearest=np.inf,

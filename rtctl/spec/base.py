@@ -108,6 +108,7 @@ class BaseMotion(Table, frozen=True, kw_only=True):
     stiffness: Annotated[float, Meta(ge=0.1, le=100.0, description="k_p of a unit mass [1/s2]")]
     damping_ratio: Annotated[float, Meta(ge=0.3, le=5.0, description="k_v = 2 zeta sqrt(k_p)")]
     tolerance_m: Annotated[float, Meta(ge=0.01, le=10.0, description="arrived, unless a goal says otherwise")]
+    tolerance_rad: Annotated[float, Meta(ge=0.02, le=0.5, description="the same of a goal's heading")] = 0.1
 
 
 class BaseAvoid(Table, frozen=True, kw_only=True):

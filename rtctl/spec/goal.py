@@ -1,5 +1,6 @@
 """What a goal asks for, as scenario files and the control socket say it, and the goal that the tick takes."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, Protocol
 
@@ -13,6 +14,7 @@ from rtctl.types import F64, Goal, Task
 
 LinearAxis = Literal["x", "y", "z"]
 Axes = Annotated[tuple[LinearAxis, ...], Meta(min_length=1, max_length=3, description="position along these alone")]
+Heading = Annotated[float, Meta(ge=-6.3, le=6.3, description="of a base, counter-clockwise from east")]
 Direction = Annotated[tuple[Unit, Unit, Unit], Meta(description="of the tool's axis in the world; roll is free")]
 ToolAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], Meta(description="of the tip's frame, for a direction")]
 _BITS = {"x": Task.X, "y": Task.Y, "z": Task.Z, "rx": Task.RX, "ry": Task.RY, "rz": Task.RZ}
@@ -36,6 +38,8 @@ class Asked(Protocol):
     @property
     def tool_axis(self) -> str | None: ...
     @property
+    def heading_rad(self) -> float | None: ...
+    @property
     def tolerance_m(self) -> float | None: ...
     @property
     def tolerance_rad(self) -> float | None: ...
@@ -54,6 +58,8 @@ def goal_contradiction(goal: Asked) -> tuple[str, object, str] | None:
     if found := orientation_contradiction(goal.rpy_rad, goal.wxyz):
         return found
     oriented = goal.rpy_rad is not None or goal.wxyz is not None
+    if goal.heading_rad is not None and (oriented or goal.hold or goal.direction):
+        return "heading_rad", goal.heading_rad, "no other orientation beside it"
     if goal.hold and oriented:
         return "hold", goal.hold, "nothing beside wxyz or rpy_rad"
     if goal.direction is not None:
@@ -89,6 +95,9 @@ def goal_from(goal: Asked, wxyz: Callable[[], F64], tolerance: float, tolerance_
     elif goal.rpy_rad is not None or goal.wxyz is not None:
         bits |= int(Task.ORIENTATION)
         turn = quaternion(goal.rpy_rad, goal.wxyz)
+    elif goal.heading_rad is not None:
+        bits |= int(Task.RZ)
+        turn = np.array([math.cos(0.5 * goal.heading_rad), 0.0, 0.0, math.sin(0.5 * goal.heading_rad)])
     else:
         bits |= int(Task.ORIENTATION) if goal.hold else 0
         turn = np.array(wxyz(), dtype=np.float64) if goal.hold else np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from rtctl.errors import ConfigError
 from rtctl.plain import Json
-from rtctl.spec.goal import Axes, Direction, ToolAxis, goal_contradiction, goal_from
+from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
 from rtctl.spec.obstacles import (
     Coordinate,
     Name,
@@ -38,6 +38,7 @@ class GoalTable(Table, frozen=True, kw_only=True):
     hold: Literal["orientation"] | None = None
     direction: Direction | None = None
     tool_axis: ToolAxis | None = None  # None: z
+    heading_rad: Heading | None = None  # of a base
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=1.0)] | None = None
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=3.2)] | None = None
 

@@ -42,6 +42,7 @@ FIELDS: dict[str, Field] = {
     "goal_axis": Field("", "axis of the tool that a direction is for, tip's frame"),
     "task": Field("", "what of the motion the goal constrains, types.Task"),
     "F": Field("m/s2, rad/s2", "command vector F* of the motion task"),
+    "goal_heading": Field("rad", "heading that a base's goal asks for, NaN: none"),
     "error": Field("m", "distance to the goal along the axes of the task"),
     "error_rot": Field("rad", "angle to the goal"),
     "sigma_min": Field("1/kg", "smallest eigenvalue of J A^-1 J^T"),
