@@ -79,6 +79,7 @@ class Rating(NamedTuple):
     baud: int = 4
     e2e: bool = False  # 12-byte frames with counter and CRC
     release_ns: int = BRAKE_RELEASE_NS  # of the holding brake, 0 for a drive without one to wait for
+    reply: int = -1  # CAN id of its replies; -1: motor + 0x10
 
 
 class Actuation(NamedTuple):
@@ -104,7 +105,7 @@ class Drive:
     def __init__(self, rating: Rating) -> None:
         self.rating = rating
         self.flash: dict[int, float] = {
-            codec.MST_ID: rating.motor + 0x10,
+            codec.MST_ID: rating.motor + 0x10 if rating.reply < 0 else rating.reply,
             codec.ESC_ID: rating.motor,
             codec.TIMEOUT: rating.timeout,
             codec.CTRL_MODE: 1,

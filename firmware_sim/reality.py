@@ -29,7 +29,7 @@ class Reality(NamedTuple):
     viscous: tuple[float, ...]  # [Nms/rad] beside the robot file's
     torque_gain: tuple[float, ...]  # of the torque a drive believes to give, what the joint gets
     brake: tuple[float, ...]  # [Nm] of a holding brake, IDEAL, 0 none
-    encoder_zero: tuple[float, ...]  # [rad] the drive reads direction * q + zero
+    encoder_zero: tuple[float, ...]  # [rad] the drive reads direction * q + zero; by default as the robot file says
     encoder_direction: tuple[float, ...]  # 1 or -1
     reply_loss: float  # share of replies that never arrive
     reply_late: float  # share of replies that arrive a period late
@@ -62,8 +62,8 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
         viscous=_each(table, "viscous_Nms_rad", n, 0.0, _within(0.0, 1000.0)),
         torque_gain=_each(table, "torque_gain", n, 1.0, _within(0.0, 2.0)),
         brake=_each(table, "brake", n, "ideal", _brake),
-        encoder_zero=_each(table, "encoder_zero_rad", n, 0.0, _within(-100.0, 100.0)),
-        encoder_direction=_each(table, "encoder_direction", n, 1.0, _direction),
+        encoder_zero=_each(table, "encoder_zero_rad", n, [j.zero for j in settings.joints], _within(-100.0, 100.0)),
+        encoder_direction=_each(table, "encoder_direction", n, [j.direction for j in settings.joints], _direction),
         reply_loss=_one(table, "reply_loss", 0.0, _within(0.0, 1.0)),
         reply_late=_one(table, "reply_late", 0.0, _within(0.0, 1.0)),
         talkers=_ids(table, "talker_ids"),

@@ -39,6 +39,8 @@ class JointSetting(NamedTuple):
     q_max: float
     armature: float  # [kg m^2] motor inertia seen at the joint
     friction: float  # [Nms/rad] viscous, seen at the joint
+    direction: float  # 1 or -1: the drive reads direction * q + zero
+    zero: float  # [rad]
 
 
 class Settings(NamedTuple):
@@ -145,6 +147,8 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
                 float(j["q_max_rad"]),
                 float(j.get("armature_kg_m2", 0.0)),
                 float(j.get("friction_Nms_rad", 0.0)),
+                float(j.get("direction", 1)),
+                float(j.get("zero_rad", 0.0)),
             )
             for j in robot["joints"]
         ),
@@ -170,5 +174,6 @@ def _rating(joint: dict[str, Any], scales: dict[str, codec.Scale], common: dict[
         torque=float(joint["tau_max_Nm"]),
         torque_rate=float(joint["tau_rate_Nm_s"]),
         speed=float(joint["qd_max_rad_s"]),
+        reply=int(joint.get("reply_id", -1)),
         **common,
     )

@@ -36,6 +36,7 @@ class FakeDrives:
     def __init__(self, spec: LinkSpec) -> None:
         n = len(spec.joints)
         self.ids = [joint.can_id for joint in spec.joints]
+        self.replies = [joint.reply_id for joint in spec.joints]
         self.protected, self.fd, self.brs = spec.protocol == MIT_E2E, spec.fd, spec.fd
         self.err = [0] * n
         self.codes = [(0x8000, 0x800, 0x800)] * n  # p, v, t
@@ -45,8 +46,8 @@ class FakeDrives:
         self.mischief: Mischief = lambda joint, raw: [raw]
         self.write_works = True
         self.registers: list[dict[int, Any]] = [
-            {7: i + 0x10, 8: i, 9: TIMEOUT_COUNTS, 10: 1, 21: SCALE.p_max, 22: SCALE.v_max, 23: SCALE.t_max}
-            for i in self.ids
+            {7: r, 8: i, 9: TIMEOUT_COUNTS, 10: 1, 21: SCALE.p_max, 22: SCALE.v_max, 23: SCALE.t_max}
+            for i, r in zip(self.ids, self.replies, strict=True)
         ]
         self.written: list[tuple[int, int]] = []  # (joint, register)
 
@@ -70,7 +71,7 @@ class FakeDrives:
 
     def sealed(self, joint: int, data: bytes) -> bytes:
         """Return the raw frame of a reply, with the next counter where the link is protected."""
-        can_id = self.ids[joint] + 0x10
+        can_id = self.replies[joint]
         if self.protected:
             self.counters[joint] = (self.counters[joint] + 1) % 256
             data += bytes((self.counters[joint], self.status[joint]))

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from rtctl.protocol import batch, e2e, frame, mit
+from rtctl.protocol.mounting import Wiring
 from rtctl.types import Frames
 
 N = 7
 IDS = tuple(range(1, N + 1))
 SCALES = (*(mit.DRIVES["DM8009"],) * 3, *(mit.DRIVES["DM4340"],) * 2, *(mit.DRIVES["DM4310"],) * 2)
+DRIVES = [Wiring(i, i + mit.REPLY_OFFSET, scale) for i, scale in zip(IDS, SCALES, strict=True)]
 KINDS = [(False, False), (False, True), (True, True)]  # protected, CAN FD
 
 
@@ -43,7 +45,7 @@ def decoded(cycle: batch.Cycle, raw: list[bytes], receivers: e2e.Receivers) -> b
 @pytest.mark.parametrize(("protected", "fd"), KINDS)
 def test_replies_in_any_order_mean_what_the_codec_of_one_says(protected: bool, fd: bool) -> None:
     rng = random.Random(1)
-    cycle = batch.cycle_of(protected, fd, IDS, SCALES)
+    cycle = batch.cycle_of(protected, fd, DRIVES)
     for _ in range(200):
         last = [rng.randrange(256) for _ in IDS]
         raw = replies(rng, protected, fd, [(each + 1) & 0xFF for each in last])
@@ -68,7 +70,7 @@ def test_replies_in_any_order_mean_what_the_codec_of_one_says(protected: bool, f
 @pytest.mark.parametrize(("protected", "fd"), KINDS)
 def test_commands_are_the_bytes_of_the_codec_of_one(protected: bool, fd: bool) -> None:
     rng = np.random.default_rng(2)
-    cycle = batch.cycle_of(protected, fd, IDS, SCALES)
+    cycle = batch.cycle_of(protected, fd, DRIVES)
     counters = np.arange(250, 250 + N)
     cases = [rng.normal(size=N) * 30.0 for _ in range(200)]
     cases += [np.zeros(N), np.full(N, 1e300), np.full(N, np.nan), np.full(N, -np.inf), np.full(N, -0.0)]
@@ -84,7 +86,7 @@ def test_commands_are_the_bytes_of_the_codec_of_one(protected: bool, fd: bool) -
 
 def test_what_is_not_whole_is_not_taken() -> None:
     rng = random.Random(3)
-    cycle = batch.cycle_of(True, True, IDS, SCALES)
+    cycle = batch.cycle_of(True, True, DRIVES)
     last = [0] * N
 
     def taken(raw: list[bytes]) -> bool:

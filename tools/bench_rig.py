@@ -130,7 +130,7 @@ class Bus:
         self._counter = (self._counter + 1) & 0xFF
         frames = []
         for j, joint in enumerate(self.spec.joints):
-            (p_max, v_max, t_max), can_id = joint.scale, joint.can_id + mit.REPLY_OFFSET
+            (p_max, v_max, t_max), can_id = joint.scale, joint.reply_id
             word = int(f.drive[j]) << 60 | (joint.can_id & 0xF) << 56 | mit.code(f.q[j], -p_max, p_max, 16) << 40
             word |= mit.code(f.qd[j], -v_max, v_max, 12) << 28 | mit.code(f.tau[j], -t_max, t_max, 12) << 16 | 0x2021
             data = word.to_bytes(8, "big")

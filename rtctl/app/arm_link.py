@@ -11,6 +11,7 @@ from rtctl.design import Config, scales
 from rtctl.hal.can.handshake import handshake
 from rtctl.hal.can.link import CanLink, JointSpec, LinkSpec, identifiers
 from rtctl.hal.can.transport import open_transport
+from rtctl.protocol.mounting import Mounting
 from rtctl.types import F64, Feedback, Transport
 
 
@@ -21,13 +22,16 @@ class ArmLink(CanLink):
         """`listen` [s] for a second master during the handshake."""
         super().__init__(spec, transport)
         self.listen = listen
-        self.said: deque[str] = deque()  # drives tell people nothing
+        self.said: deque[str] = deque()  # what the handshake found, for people
 
     def greet(self, lockstep: bool, say: Say | None = None, ended: Callable[[], bool] = never) -> Feedback:
         """Return the feedback that the handshake leaves. Raises HandshakeError."""
         if lockstep:  # a busy machine may take its time: none passes for the drives
-            return first_feedback(handshake(self, listen=0.0, recover=True, timeout=LOCKSTEP_WAIT).q)
-        return first_feedback(handshake(self, listen=self.listen, recover=True).q)
+            found = handshake(self, listen=0.0, recover=True, timeout=LOCKSTEP_WAIT)
+        else:
+            found = handshake(self, listen=self.listen, recover=True)
+        self.said += found.told
+        return first_feedback(found.q)
 
     def settle(self) -> None:
         """Do nothing: drives speak when they are spoken to."""
@@ -45,7 +49,16 @@ def first_feedback(q: F64) -> Feedback:
 def link_spec(config: Config) -> LinkSpec:
     """Return what the link needs to know."""
     joints = tuple(
-        JointSpec(j.name, j.can_id, scale, j.q_min_rad, j.q_max_rad)
+        JointSpec(
+            j.name,
+            j.can_id,
+            scale,
+            j.q_min_rad,
+            j.q_max_rad,
+            j.reply_id,
+            Mounting(j.direction, j.zero_rad),
+            j.wrap,
+        )
         for j, scale in zip(config.robot.joints, scales(config), strict=True)
     )
     return LinkSpec(

@@ -13,7 +13,7 @@ from rtctl.app.arm_link import ArmLink, first_feedback, link_spec
 from rtctl.app.vehicle import Rebuilt
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
-from rtctl.design import Config, scales
+from rtctl.design import Config
 from rtctl.design.assets import files_named
 from rtctl.errors import ConfigError, LogError
 from rtctl.kernel.rotations import R_of, quat_of
@@ -55,8 +55,8 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
 
 def drive_dbc(config: Config) -> str:
     """Return the DBC of the robot's own identifiers and scales."""
-    joints = [DbcJoint(j.name, j.can_id, *scale) for j, scale in zip(config.robot.joints, scales(config), strict=True)]
-    return dbc_of(joints, config.link.protocol == "mit+e2e", mit.REPLY_OFFSET, mit.KP_MAX, mit.KD_MAX)
+    joints = [DbcJoint(j.name, j.can_id, j.reply_id, *j.scale) for j in link_spec(config).joints]
+    return dbc_of(joints, config.link.protocol == "mit+e2e", mit.KP_MAX, mit.KD_MAX)
 
 
 def scene_of(config: Config, robot: Robot) -> str:

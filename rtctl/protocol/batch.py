@@ -1,14 +1,16 @@
-"""A cycle's frames at once, in one compiled pass: to the bit what `mit` and `e2e` make of them one by one.
+"""A cycle's frames at once, in one compiled pass: to the bit what `mounting` and `e2e` make of them one by one.
 
 Only a whole and healthy cycle is taken here; anything else is for the patient code to judge, frame by frame.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.protocol import e2e, frame, mit
+from rtctl.protocol.mounting import Wiring, fields_of
 from rtctl.types import F64, I64, U8, Frames
 
 _DATA = 8  # where the data begin in a raw frame
@@ -34,8 +36,8 @@ class Cycle(NamedTuple):
     """What never changes about the frames of n joints."""
 
     protected: bool  # mit+e2e
-    scale: F64  # (n, 3) p_max [rad], v_max [rad/s], t_max [Nm]
-    can_id: I64  # (n,) of commands; replies come under mit.REPLY_OFFSET more
+    worth: F64  # (n, 8) of a reply's codes: `mounting.Fields`; of a command's: t_max [Nm], direction
+    ids: I64  # (n, 2) of commands and of replies
     words: U8  # (n, 4) the first bytes of each reply
     block: U8  # (n, size) the commands: `encode` writes torque and protection, the rest stays
 
@@ -48,16 +50,17 @@ class Replies(NamedTuple):
     report: int  # all e2e.Report bits that some joint says
 
 
-def cycle_of(protected: bool, fd: bool, can_ids: tuple[int, ...], scales: tuple[mit.Scale, ...]) -> Cycle:
+def cycle_of(protected: bool, fd: bool, drives: Sequence[Wiring]) -> Cycle:
     """Return what the frames of these joints have in common."""
     length, size = (e2e.LENGTH if protected else mit.LENGTH), (frame.CANFD_MTU if fd else frame.CAN_MTU)
     flags = frame.FD_FDF | frame.FD_BRS if fd else 0
-    heads = [frame.HEAD.pack(i, length, flags) + b"\0\0" + _FILL for i in can_ids]
-    words = [frame.HEAD.pack(i + mit.REPLY_OFFSET, 0, 0)[:4] for i in can_ids]
+    heads = [frame.HEAD.pack(d.can_id, length, flags) + b"\0\0" + _FILL for d in drives]
+    words = [frame.HEAD.pack(d.reply_id, 0, 0)[:4] for d in drives]
+    worth = [(*fields_of(d.scale, d.mounting), d.scale.t_max, d.mounting.direction) for d in drives]
     return Cycle(
         protected,
-        np.array(scales, np.float64).reshape(-1, 3),
-        np.array(can_ids, np.int64),
+        np.array(worth, np.float64).reshape(-1, 8),
+        np.array([(d.can_id, d.reply_id) for d in drives], np.int64).reshape(-1, 2),
         np.frombuffer(b"".join(words), np.uint8).reshape(-1, 4).copy(),
         np.frombuffer(b"".join(head.ljust(size, b"\0") for head in heads), np.uint8).reshape(-1, size).copy(),
     )
@@ -72,14 +75,14 @@ def decode(cycle: Cycle, frames: Frames, receivers: e2e.Receivers, age: float) -
     if frames.size != size or len(frames.data) != n * size:
         return None
     raw, last, disorder = np.frombuffer(frames.data, np.uint8), receivers.last, receivers.disorder
-    state, codes, report = _decode(raw, cycle.protected, cycle.scale, cycle.can_id, cycle.words, last, disorder, age)
+    state, codes, report = _decode(raw, cycle.protected, cycle.worth, cycle.ids, cycle.words, last, disorder, age)
     return None if report < 0 else Replies(state, codes, report)
 
 
 def encode(cycle: Cycle, tau: F64, counters: I64) -> Frames:
-    """Return a raw frame of torque [Nm] for each joint; counts on in `counters` (n,) where frames are protected."""
+    """Return a raw frame of the torque [Nm] of each joint; counts on in `counters` (n,) where frames are protected."""
     block = cycle.block
-    _encode(block, cycle.protected, cycle.scale, cycle.can_id, tau, counters)
+    _encode(block, cycle.protected, cycle.worth, cycle.ids, tau, counters)
     return Frames(block.tobytes(), block.shape[1])
 
 
@@ -94,10 +97,10 @@ def _crc(raw: U8, at: int, can_id: int) -> int:
 
 @kernel
 def _decode(
-    raw: U8, protected: bool, scale: F64, can_id: I64, words: U8, last: I64, disorder: I64, age: float
+    raw: U8, protected: bool, worth: F64, ids: I64, words: U8, last: I64, disorder: I64, age: float
 ) -> tuple[F64, I64, int]:
     """Return the fields of `Replies` and count on in `last`; report -1, and `last` as it was, unless all is whole."""
-    n, report = len(can_id), 0
+    n, report = len(ids), 0
     size = len(raw) // n
     state, codes = np.empty((4, n)), np.zeros((6, n), np.int64)
     for i in range(n):
@@ -113,12 +116,12 @@ def _decode(
         if j == n or codes[5, j] != 0 or raw[head + _AT_LENGTH] != (e2e.LENGTH if protected else mit.LENGTH):
             return state, codes, -1
         codes[5, j] = 1
-        if raw[at] & 0xF != can_id[j] & 0xF:
+        if raw[at] & 0xF != ids[j, 0] & 0xF:
             return state, codes, -1
         if protected:
             sent = np.int64(raw[at + e2e.COVERED]) << 8 | np.int64(raw[at + e2e.COVERED + 1])
             counter = np.int64(raw[at + 8])
-            if _crc(raw, at, can_id[j] + mit.REPLY_OFFSET) != sent or disorder[j] != 0:
+            if _crc(raw, at, ids[j, 1]) != sent or disorder[j] != 0:
                 return state, codes, -1
             if counter != (last[j] + 1) & 0xFF:
                 return state, codes, -1
@@ -126,10 +129,9 @@ def _decode(
             report |= codes[4, j]
         b1, b2, b3 = np.int64(raw[at + 1]), np.int64(raw[at + 2]), np.int64(raw[at + 3])
         b4, b5 = np.int64(raw[at + 4]), np.int64(raw[at + 5])
-        p_max, v_max, t_max = scale[j, 0], scale[j, 1], scale[j, 2]
-        state[0, j] = (b1 << 8 | b2) * (2.0 * p_max / 65535.0) - p_max
-        state[1, j] = (b3 << 4 | b4 >> 4) * (2.0 * v_max / 4095.0) - v_max
-        state[2, j] = ((b4 & 0xF) << 8 | b5) * (2.0 * t_max / 4095.0) - t_max
+        state[0, j] = (b1 << 8 | b2) * worth[j, 0] + worth[j, 1]
+        state[1, j] = (b3 << 4 | b4 >> 4) * worth[j, 2] + worth[j, 3]
+        state[2, j] = ((b4 & 0xF) << 8 | b5) * worth[j, 4] + worth[j, 5]
         state[3, j] = age
         codes[0, j], codes[1, j], codes[2, j] = raw[at] >> 4, raw[at + 6], raw[at + 7]
     if protected:
@@ -139,17 +141,17 @@ def _decode(
 
 
 @kernel
-def _encode(out: U8, protected: bool, scale: F64, can_id: I64, tau: F64, counters: I64) -> None:
+def _encode(out: U8, protected: bool, worth: F64, ids: I64, tau: F64, counters: I64) -> None:
     for j in range(out.shape[0]):
-        t_max = scale[j, 2]
-        t = tau[j] if np.isfinite(tau[j]) else 0.0
+        t_max = worth[j, 6]
+        t = worth[j, 7] * tau[j] if np.isfinite(tau[j]) else 0.0
         code = np.int64(min(max((t + t_max) * 4095 / (t_max + t_max), 0.0), 4095) + 0.5)
         data = out[j]
         data[_DATA + 6], data[_DATA + 7] = code >> 8, code & 0xFF
         if protected:
             counters[j] = (counters[j] + 1) & 0xFF
             data[_DATA + 8], data[_DATA + 9] = counters[j], _WANTED
-            crc = _crc(data, _DATA, can_id[j])
+            crc = _crc(data, _DATA, ids[j, 0])
             data[_DATA + 10], data[_DATA + 11] = crc >> 8, crc & 0xFF
 
 

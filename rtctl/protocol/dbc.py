@@ -17,13 +17,14 @@ class Joint(NamedTuple):
 
     name: str
     can_id: int
+    reply_id: int
     p_max: float  # [rad]
     v_max: float  # [rad/s]
     t_max: float  # [Nm]
 
 
-def dbc_of(joints: Sequence[Joint], protected: bool, offset: int, kp_max: float, kd_max: float) -> str:
-    """Return the text of a DBC; offset: of a reply's identifier from its command's."""
+def dbc_of(joints: Sequence[Joint], protected: bool, kp_max: float, kd_max: float) -> str:
+    """Return the text of a DBC; its signals are the drives', not the joints' where a drive is mounted otherwise."""
     lines = ['VERSION "rtctl MIT-mode joint drives"', "", "NS_ :", "", "BS_:", "", "BU_: Controller Drive", ""]
     for j in joints:
         command = [
@@ -49,8 +50,8 @@ def dbc_of(joints: Sequence[Joint], protected: bool, offset: int, kp_max: float,
                 signals.append(_signal(87, 16, "crc", 1, 0, 0, 65535, "", node))
         length = 12 if protected else 8
         lines += [f"BO_ {j.can_id} {j.name}_command: {length} Controller", *command, ""]
-        lines += [f"BO_ {j.can_id + offset} {j.name}_reply: {length} Drive", *reply, ""]
-    lines += [f"VAL_ {j.can_id + offset} err {_STATUS} ;" for j in joints]
+        lines += [f"BO_ {j.reply_id} {j.name}_reply: {length} Drive", *reply, ""]
+    lines += [f"VAL_ {j.reply_id} err {_STATUS} ;" for j in joints]
     return "\n".join(lines) + "\n"
 
 

@@ -42,8 +42,16 @@ class PlantTable(Table, frozen=True, kw_only=True):
     viscous_Nms_rad: Annotated[Torque | Torques, Meta(description="beside the robot file's")] = 0.0
     torque_gain: Annotated[Gain | Gains, Meta(description="what the joint gets, of what the drive says it gives")] = 1.0
     brake: Annotated[Brake | Brakes, Meta(description="a number: the Nm at which it slips")] = "ideal"
-    encoder_zero_rad: Annotated[Zero | Zeros, Meta(description="a drive reads direction * q + zero")] = 0.0
-    encoder_direction: Annotated[Direction | Directions, Meta(description="-1: mounted the other way round")] = 1
+    encoder_zero_rad: (
+        Annotated[Zero | Zeros, Meta(description="a drive reads direction * q + zero; default: as the robot file says")]
+        | None
+    ) = None
+    encoder_direction: (
+        Annotated[
+            Direction | Directions, Meta(description="-1: mounted the other way round; default: as the file says")
+        ]
+        | None
+    ) = None
     reply_loss: Annotated[Share, Meta(description="of the drives' replies, that never arrive")] = 0.0
     reply_late: Annotated[Share, Meta(description="of the drives' replies, that arrive a period late")] = 0.0
     talker_ids: Annotated[

@@ -5,7 +5,7 @@ import re
 import tomllib
 from datetime import date, time
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -105,13 +105,20 @@ def _explain(data: object, kind: Any, source: str, message: str, where: str) -> 
 
 def _culprit(value: Any, node: inspect.Type) -> str:
     """Return the key of the first entry of a dict that does not convert; msgspec only says [...]."""
-    entry = _member(_member(node, inspect.DictType).value_type, inspect.StructType)
+    entry = _plain(_member(node, inspect.DictType).value_type)[0]
+    kind = entry.cls if isinstance(entry, inspect.StructType) else _number(entry)
     for key, item in value.items():
         try:
-            msgspec.convert(item, entry.cls)
+            msgspec.convert(item, kind)
         except msgspec.ValidationError:
             return str(key)
     raise AssertionError(f"no fault in {value}")
+
+
+def _number(node: inspect.Type) -> Any:
+    """Return the bounded number that a table's entries are."""
+    assert isinstance(node, inspect.FloatType)
+    return Annotated[float, msgspec.Meta(ge=node.ge, le=node.le)]
 
 
 def _plain(node: inspect.Type) -> list[inspect.Type]:
@@ -136,9 +143,10 @@ def _inside(node: inspect.Type, value: Any, key: Any) -> inspect.Type:
     """Return the type of what is at `key` inside a value of type `node`."""
     if isinstance(key, str):
         options = _plain(node)
-        if isinstance(options[0], inspect.DictType):
-            inner: inspect.Type = options[0].value_type
-            return inner
+        for option in options:
+            if isinstance(option, inspect.DictType):
+                inner: inspect.Type = option.value_type
+                return inner
         table = _table(node, value)
         if key == table.tag_field:
             return _tags(node)

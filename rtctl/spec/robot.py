@@ -27,7 +27,7 @@ class Joint(Table, frozen=True, kw_only=True):
     """One joint, in the order of the chain from the base to the tip."""
 
     name: Annotated[Key, Meta(description="joint of the URDF")]
-    can_id: Annotated[int, Meta(ge=1, le=15, description="motor id; its replies come on can_id + 0x10")]
+    can_id: Annotated[int, Meta(ge=1, le=0x7F, description="motor id")]
     q_min_rad: Angle
     q_max_rad: Angle
     qd_max_rad_s: Annotated[float, Meta(ge=0.01, le=100.0)]
@@ -36,6 +36,12 @@ class Joint(Table, frozen=True, kw_only=True):
     drive: Annotated[Name, Meta(description="a drive of the catalogue or of [drives]: its scales on the wire")]
     armature_kg_m2: Annotated[float, Meta(ge=0.0, le=100.0, description="motor inertia seen at the joint, J G^2")] = 0.0
     friction_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="viscous, seen at the joint, B G^2")] = 0.0
+    reply_id: Annotated[int, Meta(ge=1, le=0x7FE, description="of its replies; default: can_id + 0x10")] | None = None
+    direction: Annotated[Literal[1, -1], Meta(description="-1: the drive counts the other way round")] = 1
+    zero_rad: Annotated[Angle, Meta(description="the drive reads direction q + zero_rad")] = 0.0
+    wrap: Annotated[
+        bool, Meta(description="the encoder may come back whole turns off: the one within the limits is taken")
+    ] = False
 
 
 class BasePose(Table, frozen=True, kw_only=True):

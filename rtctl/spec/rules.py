@@ -10,7 +10,7 @@ from rtctl.protocol.mit import Scale
 from rtctl.spec.bus import LOAD_MAX, Load, cycle_load
 from rtctl.spec.obstacles import orientation_contradiction, refuse_obstacles
 from rtctl.spec.read import name_place
-from rtctl.spec.robot import Config
+from rtctl.spec.robot import Config, Joint
 
 
 class Found(NamedTuple):
@@ -31,6 +31,11 @@ def refuse(config: Config, source: str) -> None:
         if o.waypoints or any((*o.velocity_m_s, *o.omega_rad_s)) or o.appears_s > 0.0 or o.vanishes_s < 1e6:
             place = name_place(source, f"obstacle[{i}].name")
             raise ConfigError(place, f"{o.name}, which moves", "one at rest; moving obstacles belong in a scenario")
+
+
+def reply_id(joint: Joint) -> int:
+    """Return the identifier of a joint's replies."""
+    return joint.can_id + mit.REPLY_OFFSET if joint.reply_id is None else joint.reply_id
 
 
 def scale_of(config: Config, drive: str) -> Scale | None:
@@ -73,11 +78,19 @@ def _available(c: Config) -> Iterator[Found]:
 
 def _names(c: Config) -> Iterator[Found]:
     joints = c.robot.joints
-    columns: dict[str, list[str | int]] = {"name": [j.name for j in joints], "can_id": [j.can_id for j in joints]}
+    columns: dict[str, list[str | int]] = {
+        "name": [j.name for j in joints],
+        "can_id": [j.can_id for j in joints],
+        "reply_id": [reply_id(j) for j in joints],
+    }
     for key, values in columns.items():
         for i, value in enumerate(values):
             if value in values[:i]:
                 yield Found(f"robot.joints[{i}].{key}", value, f"one that joint {values.index(value)} does not have")
+    for i, joint in enumerate(joints):
+        if reply_id(joint) in columns["can_id"]:
+            of = joints[columns["can_id"].index(reply_id(joint))].name
+            yield Found(f"robot.joints[{i}].reply_id", reply_id(joint), f"another than can_id of {of}")
     found = orientation_contradiction(c.robot.base_pose.rpy_rad, c.robot.base_pose.wxyz)
     if found:
         yield Found(f"robot.base_pose.{found[0]}", found[1], found[2])
@@ -98,8 +111,10 @@ def _drives(c: Config) -> Iterator[Found]:
         if joint.qd_max_rad_s > scale.v_max:
             yield Found(at + "qd_max_rad_s", joint.qd_max_rad_s, f"at most v_max = {scale.v_max:g} {of}")
         for key, q in (("q_min_rad", joint.q_min_rad), ("q_max_rad", joint.q_max_rad)):
-            if abs(q) > scale.p_max:
-                yield Found(at + key, q, f"within p_max = +-{scale.p_max:g} {of}")
+            p = joint.direction * q + joint.zero_rad
+            if abs(p) > scale.p_max:
+                reads = f"; the drive reads {p:g} there" if p != q else ""
+                yield Found(at + key, q, f"within p_max = +-{scale.p_max:g} {of}{reads}")
 
 
 def _rates(c: Config) -> Iterator[Found]:

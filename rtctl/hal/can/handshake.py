@@ -13,6 +13,7 @@ import numpy as np
 from rtctl.errors import HandshakeError
 from rtctl.hal.can.link import CanLink
 from rtctl.hal.can.transport import SocketCan
+from rtctl.hal.can.turns import position
 from rtctl.protocol import frame, mit
 from rtctl.types import F64, Link
 
@@ -28,6 +29,7 @@ class Greeting(NamedTuple):
 
     q: F64  # (n,) [rad]
     watchdogs_written: tuple[str, ...]  # joints whose TIMEOUT register had to be changed
+    told: tuple[str, ...]  # what people should know: encoders that came back whole turns off
     sent: list[bytes]
     received: list[bytes]
 
@@ -50,9 +52,9 @@ def handshake(
         for j, register in enumerate(talk.read(rid)):
             _compare(talk.place(j), register, wanted[j])
     written = _arm_watchdogs(talk)
-    q = _positions(talk, recover)
+    q, told = _positions(talk, recover)
     link.restarted, link.bus_state = True, Link.NONE
-    return Greeting(q, written, talk.sent, talk.received)
+    return Greeting(q, written, told, talk.sent, talk.received)
 
 
 def check_interface(channel: str, fd: bool, net: Path = _NET) -> None:
@@ -83,7 +85,7 @@ def _identity(link: CanLink) -> list[tuple[int, list[float]]]:
     joints = link.spec.joints
     return [
         (mit.ESC_ID, [joint.can_id for joint in joints]),
-        (mit.MST_ID, [joint.can_id + mit.REPLY_OFFSET for joint in joints]),
+        (mit.MST_ID, [joint.reply_id for joint in joints]),
         (mit.CTRL_MODE, [mit.MODE_MIT for _ in joints]),
         (mit.PMAX, [joint.scale.p_max for joint in joints]),
         (mit.VMAX, [joint.scale.v_max for joint in joints]),
@@ -114,23 +116,26 @@ def _arm_watchdogs(talk: "_Talk") -> tuple[str, ...]:
     return tuple(joints[j].name for j in wrong)
 
 
-def _positions(talk: "_Talk", recover: bool) -> F64:
-    """Return the joint angles; outside its limits an arm is refused unless recovering it was asked for."""
-    replies = talk.stop_frames()
-    talk.link.pending = [raw for raw, _ in replies]
-    q = []
+def _positions(talk: "_Talk", recover: bool) -> tuple[F64, tuple[str, ...]]:
+    """Return the joint angles (n,) [rad] and what is told of them, and let the link know of whole turns.
+
+    Outside its limits an arm is refused unless recovering it was asked for.
+    """
+    link, replies = talk.link, talk.stop_frames()
+    link.pending = [raw for raw, _ in replies]
+    found = []
     for j, (_, data) in enumerate(replies):
-        spec = talk.link.spec.joints[j]
+        spec = link.spec.joints[j]
         reply = mit.decode_reply(data[: mit.LENGTH], spec.scale)
         if reply is None or reply.id != spec.can_id & 0xF:
             raise HandshakeError(f"{talk.place(j)}: reply", data.hex(), f"the id {spec.can_id & 0xF} in its first byte")
-        if not (recover or spec.q_min <= reply.p <= spec.q_max):
-            wanted = f"{spec.q_min:g} to {spec.q_max:g} rad, or recover"
-            raise HandshakeError(f"{talk.place(j)}: position", f"{reply.p:.4f} rad", wanted)
-        if talk.link.protected:
-            talk.link.receivers.restart(j, data[8] - 1 & 0xFF)  # the first read judges this reply again
-        q.append(reply.p)
-    return np.array(q)
+        found.append(position(spec, reply.p, f"{talk.place(j)}: position", recover))
+        if link.protected:
+            link.receivers.restart(j, data[8] - 1 & 0xFF)  # the first read judges this reply again
+    link.turn(tuple(each.turns for each in found))
+    decoded = [link.decode(j, data) for j, (_, data) in enumerate(replies)]
+    q = np.array([reply.p for reply in decoded if reply is not None])
+    return q, tuple(f"{link.spec.joints[j].name}: {each.told}" for j, each in enumerate(found) if each.told)
 
 
 class _Talk:
@@ -177,7 +182,7 @@ class _Talk:
             if len(replies) == len(self.link.spec.joints):
                 return [replies[j] for j in self._everyone()]
         absent = min(set(self._everyone()) - set(replies))
-        wanted = f"a reply on id {self.link.spec.joints[absent].can_id + mit.REPLY_OFFSET:#x}"
+        wanted = f"a reply on id {self.link.spec.joints[absent].reply_id:#x}"
         raise HandshakeError(self.place(absent), f"no answer{self._trouble()}", wanted)
 
     def read(self, rid: int) -> list[mit.Register]:

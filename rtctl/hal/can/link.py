@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.protocol import batch, e2e, frame, mit
+from rtctl.protocol.mounting import STRAIGHT, Mounting, Wiring, fields_of, joint_reply
 from rtctl.types import F64, I64, Command, Drive, Feedback, Frames, Link, Transport
 
 MIT, MIT_E2E = "mit", "mit+e2e"
@@ -28,6 +29,14 @@ class JointSpec(NamedTuple):
     scale: mit.Scale
     q_min: float
     q_max: float
+    reply: int | None = None  # identifier of its replies; None: can_id + mit.REPLY_OFFSET
+    mounting: Mounting = STRAIGHT  # its turns are what the handshake finds
+    wraps: bool = False  # its encoder may come back whole turns off when it is switched on
+
+    @property
+    def reply_id(self) -> int:
+        """Identifier of the replies."""
+        return self.can_id + mit.REPLY_OFFSET if self.reply is None else self.reply
 
 
 class LinkSpec(NamedTuple):
@@ -43,8 +52,8 @@ class LinkSpec(NamedTuple):
 
 def identifiers(joints: Iterable[JointSpec]) -> tuple[int, ...]:
     """Return the identifiers a link listens to: the replies, and the commands that nobody else may send."""
-    ids = [joint.can_id for joint in joints]
-    return (*(i + mit.REPLY_OFFSET for i in ids), *ids, mit.REGISTER_ID)
+    known = list(joints)
+    return (*(joint.reply_id for joint in known), *(joint.can_id for joint in known), mit.REGISTER_ID)
 
 
 class CanLink:
@@ -64,11 +73,10 @@ class CanLink:
         self._length = e2e.LENGTH if self.protected else mit.LENGTH
         self._size = frame.CANFD_MTU if spec.fd else frame.CAN_MTU
         self._padding = bytes(self._size - 8 - self._length)
-        self._joint_of = {_word(joint.can_id + mit.REPLY_OFFSET): j for j, joint in enumerate(spec.joints)}
+        self._joint_of = {_word(joint.reply_id): j for j, joint in enumerate(spec.joints)}
         self._ours = frozenset(_word(i) for i in (*(joint.can_id for joint in spec.joints), mit.REGISTER_ID))
-        self._cycle = batch.cycle_of(
-            self.protected, spec.fd, tuple(j.can_id for j in spec.joints), tuple(j.scale for j in spec.joints)
-        )
+        self.turns: tuple[int, ...] = (0,) * n
+        self.turn((0,) * n)
         batch.warm(self._cycle)
         self._state: F64 = np.zeros((4, n))  # of the newest reply, as batch.Replies has it
         self._codes: I64 = np.zeros((6, n), np.int64)
@@ -87,6 +95,14 @@ class CanLink:
     def temperature(self) -> list[tuple[int, int]]:
         """Temperature [degC] of each joint's driver and coil."""
         return [(int(mos), int(coil)) for mos, coil in self._codes[1:3].T]
+
+    def turn(self, turns: tuple[int, ...]) -> None:
+        """From now on take each joint's encoder to be that many whole turns off: the handshake finds how many."""
+        joints, self.turns = self.spec.joints, turns
+        mountings = [joint.mounting._replace(turns=k) for joint, k in zip(joints, turns, strict=True)]
+        drives = [Wiring(j.can_id, j.reply_id, j.scale, m) for j, m in zip(joints, mountings, strict=True)]
+        self._fields = [fields_of(drive.scale, drive.mounting) for drive in drives]
+        self._cycle = batch.cycle_of(self.protected, self.spec.fd, drives)
 
     # ---- out
 
@@ -148,9 +164,13 @@ class CanLink:
         if len(raw) != self._size or raw[4] != self._length:
             return None
         data = raw[8 : 8 + self._length]
-        if self.protected and not e2e.intact(data, self.spec.joints[joint].can_id + mit.REPLY_OFFSET):
+        if self.protected and not e2e.intact(data, self.spec.joints[joint].reply_id):
             return None
         return data
+
+    def decode(self, joint: int, data: bytes) -> mit.Reply | None:
+        """Return what the data of a joint's reply say, in joint coordinates."""
+        return joint_reply(data[: mit.LENGTH], self.spec.joints[joint].scale, self._fields[joint])
 
     def is_ours(self, raw: bytes) -> bool:
         """True if a frame carries an identifier that only this program may send."""
@@ -186,10 +206,9 @@ class CanLink:
         if joint is None:
             self.take_stranger(raw)
             return
-        spec = self.spec.joints[joint]
         data = self.payload(joint, raw)
-        reply = None if data is None else mit.decode_reply(data[: mit.LENGTH], spec.scale)
-        if data is None or reply is None or reply.id != spec.can_id & 0xF:
+        reply = None if data is None else self.decode(joint, data)
+        if data is None or reply is None or reply.id != self.spec.joints[joint].can_id & 0xF:
             self.corrupt += 1
             self._flags |= Link.CORRUPT
             return
