@@ -134,6 +134,21 @@ def test_a_wall_in_the_way_is_named_with_the_link_that_it_stops(off):
     assert run.figures["contacts"] == 0
 
 
+def test_a_wall_behind_a_hundred_obstacles_is_the_same_wall(off, tmp_path: Path):
+    """What is far away takes slots and nothing else: the bits on the bus are those of the wall alone."""
+    many = changed(tmp_path, "many", self_collision="true\nescape = false\nobstacles_max = 200")
+    goal = {"at_s": 0.5, "position_m": [0.45, -0.25, 0.3]}
+    far = [
+        {"name": f"far{k}", "type": "sphere", "radius_m": 0.1, "position_m": [20.0 + k, 0.0, 0.0]} for k in range(100)
+    ]
+    scene = {"duration_s": 5.6, "start_q_rad": BESIDE, "goal": [goal]}
+    alone, last = (play({**scene, "obstacle": o}, path) for o, path in (([wall()], off), ([*far, wall()], many)))
+    assert last.digest == alone.digest
+    assert last.events[-1] == alone.events[-1]
+    assert (alone.record["blocker"][-1], last.record["blocker"][-1]) == (0, 100)
+    assert last.record["rho"].shape[1] == 200
+
+
 def test_a_wall_in_the_way_is_escaped_without_contact_or_haste():
     run = across(PANDA, 6.0)
     names = [name for _, name, _ in run.events if name != "state"]

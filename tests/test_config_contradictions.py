@@ -55,6 +55,7 @@ FILE = [  # (edits, place, word of the reason): refused from the file alone
     ([("safety.stale_hold_ms", 1.5)], "safety.stale_hold_ms", "2 servo periods"),
     ([("safety.stale_hold_ms", 10.0)], "safety.stale_hold_ms", "less than stale_stop_ms"),
     ([("safety.stale_stop_ms", 30.0)], "safety.stale_stop_ms", "watchdog_ms"),
+    ([("obstacle", [BOX, {**BOX, "name": "b"}]), ("avoid.obstacles_max", 1)], "avoid.obstacles_max", "least the 2"),
     ([("avoid.clearance_m", 0.1)], "avoid.clearance_m", "influence_m"),
     ([("avoid.self_clearance_m", 0.05)], "avoid.self_clearance_m", "self_influence_m"),
     ([("avoid.joint_clearance_rad", 0.2)], "avoid.joint_clearance_rad", "joint_influence_rad"),

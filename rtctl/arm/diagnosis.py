@@ -18,6 +18,7 @@ from rtctl.kernel.linalg import matvec, symmetric_eigen, tmatvec
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, I64, Status
 
+MASK = 64  # bits of a record's mask
 HOLDS = 0.1  # share from which something is said to hold the arm
 LOST = 0.4  # fraction of the wanted acceleration that the tip can have, below which the direction is lost
 EDGE = 0.05  # [m] curvature of the tip's height along a direction that still counts as none: the reach ends there
@@ -67,7 +68,7 @@ class Blockers(NamedTuple):
     """What holds the arm."""
 
     status: Status
-    mask: int  # bits of obstacle slots, or of joints for LIMITED and SATURATED
+    mask: int  # bits of the first 64 obstacle slots, or of joints for LIMITED and SATURATED
     main: int  # the strongest of them, -1 for none
 
 
@@ -194,8 +195,8 @@ def at_edge(J: F64, e: F64) -> bool:
 
 def names(robot: Robot, m: Memory, found: Blockers) -> tuple[str, ...]:
     """Return what holds the arm in words, the strongest first."""
-    bits = [i for i in range(64) if found.mask >> i & 1]
-    order = sorted(bits, key=lambda i: i != found.main)
+    bits = {i for i in range(MASK) if found.mask >> i & 1} | ({found.main} if found.main >= MASK else set())
+    order = sorted(bits, key=lambda i: (i != found.main, i))
     match found.status:
         case Status.LIMITED:
             return tuple(f"{robot.joints[i]} at its {_end(robot, m.joints.q, i)} limit" for i in order)
@@ -235,4 +236,4 @@ def _end(robot: Robot, q: F64, i: int) -> str:
 
 
 def _mask(bits: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> int:
-    return sum(1 << int(i) for i in bits)
+    return sum(1 << int(i) for i in bits if i < MASK)

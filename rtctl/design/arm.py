@@ -13,7 +13,7 @@ from rtctl.arm.law import prepared
 from rtctl.arm.model import RigidBody
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
-from rtctl.arm.robot import SLOTS, Robot, StopParams
+from rtctl.arm.robot import Robot, StopParams
 from rtctl.arm.self_collision import Own, nothing
 from rtctl.design import points as psp
 from rtctl.design.assets import Assets, load_assets, placed
@@ -68,7 +68,7 @@ def build(config: Config, path: str | Path) -> Robot:
         name=config.robot.name,
         n=len(joints),
         joints=tuple(j.name for j in joints),
-        slots=SLOTS,
+        slots=config.avoid.obstacles_max,
         dt=1.0 / config.loop.servo_hz,
         model_dt=1.0 / config.loop.model_hz,
         q_min=np.array([j.q_min_rad for j in joints]),
@@ -106,7 +106,7 @@ def build(config: Config, path: str | Path) -> Robot:
             frames=config.safety.stop_frames,
             stall=config.safety.stall_s,
         ),
-        scratch=field_buffers(SLOTS, len(points.link), len(joints)),
+        scratch=field_buffers(config.avoid.obstacles_max, len(points.link), len(joints)),
         tolerance=config.motion.tolerance_m,
         tolerance_rot=config.motion.tolerance_rad,
         axes=task_of(config.motion.axes),

@@ -155,6 +155,9 @@ class Avoid(Table, frozen=True, kw_only=True):
         float, Meta(ge=0.0, le=5.0, description="speed of obstacles beside the one told; times age it widens them")
     ] = 0.1
     joint_speed_rad_s: Annotated[float, Meta(ge=0.05, le=50.0, description="spent at the joint clearance")] = 1.5
+    obstacles_max: Annotated[
+        int, Meta(ge=1, le=256, description="known at once; each costs time in a tick and room in the log")
+    ] = 64
 
 
 class Estimator(Table, frozen=True, kw_only=True):
@@ -248,5 +251,5 @@ class Config(Table, frozen=True, kw_only=True):
     estimator: Estimator = Estimator()
     console: ConsoleTable = ConsoleTable()
     drives: Annotated[dict[Name, DriveTable], Meta(max_length=64)] = {}
-    obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
+    obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
     mesh: Annotated[tuple[MeshTable, ...], Meta(max_length=32)] = ()

@@ -23,7 +23,7 @@ class Found(NamedTuple):
 
 def refuse(config: Config, source: str) -> None:
     """Raise ConfigError for the first contradiction between the keys of `config`."""
-    for group in (_available, _names, _drives, _rates, _distances, _postures, _link):
+    for group in (_available, _names, _drives, _rates, _distances, _slots, _postures, _link):
         for found in group(config):
             raise ConfigError(name_place(source, found.path), found.got, found.wanted)
     refuse_obstacles(config.obstacle, source)
@@ -134,6 +134,12 @@ def _rates(c: Config) -> Iterator[Found]:
         yield Found(
             "safety.stale_stop_ms", stop, f"at most watchdog_ms = {watchdog:g}: by then drives stop by themselves"
         )
+
+
+def _slots(c: Config) -> Iterator[Found]:
+    if len(c.obstacle) > c.avoid.obstacles_max:
+        wanted = f"at least the {len(c.obstacle)} of [[obstacle]]"
+        yield Found("avoid.obstacles_max", c.avoid.obstacles_max, wanted)
 
 
 def _distances(c: Config) -> Iterator[Found]:

@@ -75,7 +75,7 @@ class Scenario(Table, frozen=True, kw_only=True):
         False
     )
     goal: Annotated[tuple[TimedGoal, ...], Meta(max_length=10_000)] = ()
-    obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=64)] = ()
+    obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
     fault: Annotated[tuple[FaultTable, ...], Meta(max_length=1000)] = ()
     plant: PlantTable | None = None  # None: the simulated arm is as described
 
