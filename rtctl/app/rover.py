@@ -70,7 +70,7 @@ def events(base: Base, before: BaseMemory, after: BaseMemory, feedback: BaseFeed
 def blocker_name(m: BaseMemory) -> str:
     """Return the name of the obstacle that holds the base, '' for none that has one."""
     if m.status == Status.BLIND:
-        return unseen(m)
+        return unseen(m) if math.isnan(m.look.heading) else f"turns to look: {unseen(m)}"
     return m.world.names[m.blocker] if m.blocker >= 0 else ""
 
 

@@ -230,12 +230,17 @@ def seen_speed(base: Base, chart: Chart, x: F64, direction: F64, coming: float, 
     half of `seen` [s] on the speed falls with its age, so that the base rests by when it counts no more.
     """
     m, most = base.margins, base.limits.v_max
-    reach = most * m.lag + most**2 / (2.0 * m.brake) + max(coming, 0.0)
+    reach = way_to_rest(base) + max(coming, 0.0)
     oldest = tick - round(base.safety.seen / base.dt)
     gap, first = seen_ahead(chart, x, direction, m.hull, reach, oldest)
     age = max(tick - first, 0) * base.dt / base.safety.seen
     fades = most * min(2.0 - 2.0 * age, 1.0)
     return min(max(fades, 0.0), spend(gap - 0.5 * CELL - max(coming, 0.0), m.brake, RESERVE * m.lag))
+
+
+def way_to_rest(base: Base) -> float:
+    """Return the way [m] from V_max to rest: lag first, then the brakes."""
+    return base.limits.v_max * base.margins.lag + base.limits.v_max**2 / (2.0 * base.margins.brake)
 
 
 def spend(gap: float, brake: float, lag: float) -> float:

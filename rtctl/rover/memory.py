@@ -1,6 +1,9 @@
 """What one tick of the base leaves to the next, as one value."""
 
+import math
 from typing import NamedTuple
+
+import numpy as np
 
 from rtctl.rover.estimator import Estimate
 from rtctl.rover.faults import Counters
@@ -9,6 +12,19 @@ from rtctl.rover.path import Way
 from rtctl.rover.signals import BaseFeedback
 from rtctl.types import F64, I64, Goal, Severity, State, Status
 from rtctl.world.obstacle_table import World
+
+
+class Look(NamedTuple):
+    """A turn on the spot that is made to see."""
+
+    heading: float  # [rad] that is turned to, NaN: no look is being made
+    until: int  # tick at which it is given up
+    place: F64  # (2,) [m] that is to be seen, infinite: none
+    made: int  # from where it stands
+    at: F64  # (2,) [m] there
+
+
+NO_LOOK = Look(math.nan, 0, np.full(2, math.inf), 0, np.zeros(2))
 
 
 class BaseMemory(NamedTuple):
@@ -42,6 +58,7 @@ class BaseMemory(NamedTuple):
     status: Status
     blocker: int
     turn: float  # [rad] heading that is turned to on the spot, NaN: none
+    look: Look
     nearest: float  # [m] least length of way to the goal so far
     still: int  # ticks since that became less
     # world

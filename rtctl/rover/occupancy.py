@@ -178,6 +178,39 @@ def _ahead(
     return gap, first
 
 
+def unseen_ahead(chart: Chart, x: F64, e: F64, radius: float, reach: float, oldest: int) -> F64 | None:
+    """Return the place (2,) [m] where that circle first comes to what is not seen within `reach` [m], None: nowhere."""
+    gap, px, py = _unseen(chart.cells, chart.seen, chart.origin, x, e, radius, reach, oldest)
+    return None if math.isinf(gap) else np.array([px, py])
+
+
+def known(chart: Chart, at: F64, oldest: int) -> bool:
+    """Return whether the cell at a place (2,) [m] has a return in it, or a beam has passed it after tick `oldest`."""
+    i, j = (int(k) for k in np.floor(at / CELL).astype(np.int64) - chart.origin)
+    if not (0 <= i < SIZE and 0 <= j < SIZE):
+        return False
+    return bool(chart.cells[i, j] > 0 or chart.seen[i, j] > oldest)
+
+
+@kernel
+def _unseen(
+    cells: U8Grid, seen: I32Grid, origin: I64, x: F64, e: F64, radius: float, reach: float, oldest: int
+) -> tuple[float, float, float]:
+    gap, px, py = math.inf, 0.0, 0.0
+    half = int((reach + radius) / CELL) + 1
+    ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
+    for i in range(max(0, ci - half), min(SIZE, ci + half + 1)):
+        for j in range(max(0, cj - half), min(SIZE, cj + half + 1)):
+            dx, dy = (origin[0] + i + 0.5) * CELL - x[0], (origin[1] + j + 0.5) * CELL - x[1]
+            along, aside = dx * e[0] + dy * e[1], dy * e[0] - dx * e[1]
+            if along <= 0.0 or abs(aside) >= radius or cells[i, j] > 0 or seen[i, j] > oldest:
+                continue
+            s = along - math.sqrt(radius * radius - aside * aside)
+            if 0.0 < s <= min(reach, gap):
+                gap, px, py = s, x[0] + dx, x[1] + dy
+    return gap, px, py
+
+
 def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
     """Return the distance (SIZE, SIZE) [m] of each cell's centre to the nearest return or told obstacle.
 

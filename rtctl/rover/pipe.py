@@ -10,7 +10,7 @@ import numpy as np
 from rtctl.kernel import reductions as scans
 from rtctl.rover import estimator, law, occupancy, path, turn
 from rtctl.rover.faults import BIT, FAULTS, Counters, severity
-from rtctl.rover.memory import BaseMemory
+from rtctl.rover.memory import NO_LOOK, BaseMemory
 from rtctl.rover.record import make_base_record
 from rtctl.rover.robot import SECTORS, Base, Wheels
 from rtctl.rover.session import detected, driving, goal_distance, supervised, with_goal
@@ -84,6 +84,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         status=Status.NO_GOAL,
         blocker=-1,
         turn=math.nan,
+        look=NO_LOOK,
         nearest=np.inf,
         still=0,
         world=table,
@@ -205,9 +206,11 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
         m = m._replace(way=kept, due=m.due if len(kept.corners) else m.tick + 1)
     whole = m.way.length + m.way.short
     gained = whole < m.nearest - PROGRESS
+    m = turn.looked(base, m)
     heading = turn.wanted(base, m)
-    busy = gained or not math.isnan(heading)
-    return m._replace(nearest=whole if gained else m.nearest, still=0 if busy else m.still + 1, turn=heading)
+    heading = m.look.heading if math.isnan(heading) else heading
+    still = 0 if gained or not math.isnan(heading) else m.still + 1
+    return m._replace(nearest=whole if gained else m.nearest, still=still, turn=heading)
 
 
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
@@ -227,6 +230,8 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     v_ref = law.integrated(base, m.v_ref, xd_d, total, elapsed) if driving(m) else np.zeros(2)
     if m.state == State.RUN and not moves:
         v_ref = np.zeros(2)  # SS2: zero twist, at once
+    if not math.isnan(m.turn) and not total.any():
+        v_ref = np.zeros(2)  # nothing to wait for
     speed = float(np.hypot(*v_ref))
     direction = v_ref / speed if speed > 1e-6 else np.array([math.cos(yaw), math.sin(yaw)])
     if base.wheels != Wheels.HOLONOMIC and not base.world_velocity:
@@ -239,8 +244,10 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     if base.safety.scan:
         by_sight = law.seen_speed(base, m.chart, m.here.x, direction, coming, m.tick)
         by_sight = min(by_sight, law.seen_speed(base, m.chart, x, direction, 0.0, m.tick))
-    waits = speed > 0.05 and by_sight < min(BLIND_SPEED, allowed)
-    m = m._replace(rho=push.rho, rho_seen=push.rho_seen, allowed_seen=by_sight, blind=m.blind + 1 if waits else 0)
+    dark = by_sight < min(BLIND_SPEED, allowed)
+    keeps = m.blind if dark and m.status == Status.BLIND else 0  # a stop to look is no end of it
+    blind = m.blind + 1 if dark and speed > 0.05 else keeps
+    m = m._replace(rho=push.rho, rho_seen=push.rho_seen, allowed_seen=by_sight, blind=blind)
     return m, (v_ref, push, xd_d, min(allowed, by_sight))
 
 
@@ -302,8 +309,7 @@ def _commanded(
         v, w = law.unicycle(base, v_ref, _ahead(base, m)[1])
         v = math.copysign(min(abs(v), allowed), v)
         if m.goal is not None and not math.isnan(m.turn) and speed < TURN_SPEED:
-            angle = turn.left(m.goal, _ahead(base, m)[1])
-            v, w, velocity = 0.0, turn.rate(base, angle, m.goal.tolerance_rot), np.zeros(2)
+            v, w, velocity = 0.0, turn.rate(base, m, _ahead(base, m)[1]), np.zeros(2)
         if m.state == State.RUN:
             v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
             w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
@@ -338,7 +344,8 @@ def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
     moves = math.hypot(*m.here.v) >= 0.3 or (turn.heading_of(m.goal) == m.turn and abs(m.here.yaw_rate) >= 0.1)
     if there and (m.status == Status.ARRIVED or not moves):
         return m._replace(status=Status.ARRIVED, blocker=-1, still=0)
-    if (m.blind * base.dt >= BLIND_TIME or m.in_force & SIGHTLESS) and math.hypot(*m.here.v) < 0.2:
+    dark = m.blind * base.dt >= BLIND_TIME or not math.isnan(m.look.heading)
+    if (dark or m.in_force & SIGHTLESS) and math.hypot(*m.here.v) < 0.2:
         return m._replace(status=Status.BLIND, blocker=-1)
     if m.still * base.dt < base.stall:
         return m._replace(status=Status.MOVING, blocker=-1)

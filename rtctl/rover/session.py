@@ -9,7 +9,7 @@ from rtctl.control.supervisor import Asked, Event, Rules, Session, supervisor_st
 from rtctl.kernel import reductions
 from rtctl.rover import faults, path, turn
 from rtctl.rover.faults import BIT, Evidence
-from rtctl.rover.memory import BaseMemory
+from rtctl.rover.memory import NO_LOOK, BaseMemory
 from rtctl.rover.robot import Base
 from rtctl.rover.signals import BaseFeedback, Word
 from rtctl.types import F64, Goal, Request, Severity, State, Status, Task, Verb
@@ -112,6 +112,7 @@ def _entered(m: BaseMemory) -> BaseMemory:
         status=Status.NO_GOAL,
         blocker=-1,
         turn=math.nan,
+        look=NO_LOOK,
         still=0,
         off=False,
         held=False,
@@ -148,6 +149,7 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
         status=Status.MOVING,
         blocker=-1,
         turn=math.nan,
+        look=NO_LOOK,
         still=0,
         way=path.NO_WAY,
         nearest=np.inf,
