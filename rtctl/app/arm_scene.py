@@ -124,7 +124,10 @@ class ArmFeed:
 
         try:
             self.follower = Follower(
-                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed), m.joints.q, self.seed
+                # bounded by what it looks at alone: a slow machine must not find another way
+                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed, within=np.inf),
+                m.joints.q,
+                self.seed,
             )
         except PlanError as error:
             self.follower = None
