@@ -10,7 +10,7 @@ from rtctl.types import Drive, State
 from tests.lab import DOWN, lab
 
 REACH = [0.45, 0.35, 0.45]
-LIES = ("stuck_encoder", "false_velocity", "encoder_jump", "weak")
+LIES = ("stuck_encoder", "false_velocity", "encoder_jump", "weak", "silent")
 BRAKED = 0.05  # [m] of the tip after the detection, with brakes that hold
 FASTER = 0.3  # [rad/s] of any joint above its speed at the detection
 KNOCK = (

@@ -31,7 +31,7 @@ ALL = (*MOTION, "torque")
 
 FAULTS = (
     Fault("feedback_stale", 2, Severity.SS2, "A", "a joint was silent for more than 3 periods"),
-    Fault("feedback_lost", 2, Severity.SS1, "R", "a joint was silent for more than 10 periods", ("link",)),
+    Fault("feedback_lost", 2, Severity.SS1, "R", "a joint was silent for more than 10 periods", (*MOTION, "link")),
     Fault("duplicate_reply", 4, Severity.LOG, "A", "a joint answered more than once in a cycle"),
     Fault("disorder", 5, Severity.SS2, "R", "replies keep overtaking each other"),
     Fault("corrupt_frames", 6, Severity.SS2, "R", "3 of 10 cycles had a frame with a wrong CRC, length or id"),
