@@ -71,7 +71,7 @@ class Severity(IntEnum):
     STO = 5  # torque off now
 
 
-class Cut(IntFlag):
+class LimitFlag(IntFlag):
     """Which protection altered the wanted torque this tick."""
 
     NONE = 0

@@ -88,21 +88,21 @@ class BaseLab:
     def armed(self) -> "BaseLab":
         """Arm and wait for RUN."""
         self.tick(Verb.ARM)
-        assert not self.m.verdict, self.m.verdict
-        assert self.run(5.0, lambda: self.m.state == State.RUN), (self.m.state, self.faults, list(self.link.news))
+        assert not self.m.refusal, self.m.refusal
+        assert self.run(5.0, lambda: self.m.state == State.RUN), (self.m.state, self.faults, list(self.link.events))
         return self
 
     def driving(self, x: float = 40.0, y: float = 0.0, seconds: float = 3.0) -> "BaseLab":
         """Arm, give a goal far away, and drive for a while."""
         self.armed().tick(goal=goal_at(x, y))
-        assert not self.m.verdict, self.m.verdict
+        assert not self.m.refusal, self.m.refusal
         self.run(seconds)
         return self
 
     def arrive(self, x: float, y: float, seconds: float = 60.0) -> bool:
         """Give a goal and return whether the base says that it has arrived."""
         self.tick(goal=goal_at(x, y))
-        assert not self.m.verdict, self.m.verdict
+        assert not self.m.refusal, self.m.refusal
         return self.run(seconds, lambda: self.m.status == Status.ARRIVED)
 
     @property

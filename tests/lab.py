@@ -277,7 +277,7 @@ class Standing:
 
     def ask(self, verb: Verb, **said: Any) -> str:
         """Return why a verb was refused, '' if it was not."""
-        return self.tick(Request(verb), **said).verdict
+        return self.tick(Request(verb), **said).refusal
 
     def state(self) -> State:
         """Return the supervisor's state."""

@@ -39,7 +39,7 @@ def test_heartbeat_late_holds_and_heartbeat_lost_latches():
     assert "heartbeat_lost" in lab.faults
     lab.run(1.0)
     lab.tick(Verb.RESET)
-    assert "heartbeat_lost" in lab.m.verdict  # still gone
+    assert "heartbeat_lost" in lab.m.refusal  # still gone
 
 
 def test_a_rebooted_autopilot_is_asked_anew_and_never_armed_again_by_itself():
@@ -129,7 +129,7 @@ def test_estimator_bad_brakes_and_latches():
     assert lab.speed < 0.05
     assert lab.m.state == State.SAFE_STOP  # healthy again, still latched
     lab.tick(Verb.RESET)
-    assert not lab.m.verdict
+    assert not lab.m.refusal
 
 
 @pytest.mark.parametrize("config", [ROVER, ROVER_PX4])

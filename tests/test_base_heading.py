@@ -127,16 +127,16 @@ def test_a_base_that_cannot_turn_on_the_spot_refuses_a_heading(config, edits, wh
     (tmp_path / "base.toml").write_text(text)
     lab = BaseLab(tmp_path / "base.toml").armed()
     lab.tick(goal=facing(5.0, 0.0, 1.0))
-    assert lab.m.verdict == f"goal: got a heading, {why}"
+    assert lab.m.refusal == f"goal: got a heading, {why}"
     assert lab.m.goal is None
     lab.tick(goal=goal_at(5.0, 0.0))
-    assert lab.m.verdict == ""
+    assert lab.m.refusal == ""
 
 
 def test_any_other_orientation_is_refused():
     lab = BaseLab().armed()
     lab.tick(goal=facing(5.0, 0.0, 1.0)._replace(task=Task.POSE))
-    assert lab.m.verdict == "goal: got an orientation, wanted heading_rad alone: a base turns in no other way"
+    assert lab.m.refusal == "goal: got an orientation, wanted heading_rad alone: a base turns in no other way"
 
 
 def test_the_console_takes_a_heading_beside_metres_or_degrees():

@@ -70,8 +70,8 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
     scan = np.full(SECTORS, np.inf)
     scan[0], scan[18] = 5.0, 3.0  # ahead, and to the right
     yaw = math.radians(90.0)
-    look = occupancy.Look(np.array([1.0, 2.0]), yaw, step, scan, 12.0)
-    seen = occupancy.looked(occupancy.empty(np.zeros(2)), look, 0)
+    look = occupancy.PlacedScan(np.array([1.0, 2.0]), yaw, step, scan, 12.0)
+    seen = occupancy.integrate_scan(occupancy.empty(np.zeros(2)), look, 0)
     near = occupancy.returns_near(seen, np.array([1.0, 2.0]), 8.0)
     oracle = np.array([[1.0, 7.0], [4.0, 2.0]])
     assert len(near) == 2
@@ -79,7 +79,7 @@ def test_a_scan_marks_what_it_touches_forgets_what_it_passes_and_follows_the_bas
         assert np.abs(near - at).max(axis=1).min() <= 0.5 * CELL + 1e-9
     clear = np.full(SECTORS, np.inf)
     for _ in range(3):
-        seen = occupancy.looked(seen, look._replace(ranges=clear), 0)
+        seen = occupancy.integrate_scan(seen, look._replace(ranges=clear), 0)
     assert not seen.cells.any()
     kept = charted([[10.0, 3.0]])
     away = occupancy.moved(kept, np.array([25.0, 0.0]))
@@ -162,12 +162,12 @@ def test_the_push_of_returns_is_the_gradient_of_the_potential_and_does_not_grow_
     none = obstacle_table.empty().obstacles
     push = law.field(BASE, x, 0.3, np.zeros(2), at[None], 1, none)
     slope = [(potential(x + h * e, at) - potential(x - h * e, at)) / (2.0 * h) for e in np.eye(2)]
-    np.testing.assert_allclose(push.seen, -np.array(slope), rtol=1e-6)
+    np.testing.assert_allclose(push.sensed, -np.array(slope), rtol=1e-6)
     wall = [np.column_stack([np.full(n, 1.2), np.linspace(-3.0, 3.0, n)]) for n in (61, 601)]
-    coarse, fine = (law.field(BASE, x, 0.0, np.zeros(2), w, len(w), none).seen for w in wall)
+    coarse, fine = (law.field(BASE, x, 0.0, np.zeros(2), w, len(w), none).sensed for w in wall)
     np.testing.assert_allclose(coarse, fine, rtol=0.02, atol=1e-9)
     between = np.vstack([wall[0], wall[0] * (-1.0, 1.0)])
-    np.testing.assert_allclose(law.field(BASE, x, 0.0, np.zeros(2), between, 0, none).seen, 0.0, atol=1e-9)
+    np.testing.assert_allclose(law.field(BASE, x, 0.0, np.zeros(2), between, 0, none).sensed, 0.0, atol=1e-9)
 
 
 def test_the_control_point_moves_as_the_reference_wants_while_nothing_saturates():
@@ -235,9 +235,9 @@ def test_the_governor_sees_told_obstacles_as_far_off_as_they_are():
     ball = Shape("b", "sphere", np.array([0.7, 0, 0, 0]), np.array([5.0, 0.4, 0.3]), UPRIGHT, *np.zeros((2, 3)))
     table, _ = obstacle_table.edited(obstacle_table.empty(), (ObstacleEdit("b", ball),))
     r = BASE.margins.hull + BASE.margins.stop
-    gap = law._gap_told(np.zeros(2), np.array([1.0, 0.0]), r, 0.3, table.obstacles, 30.0)
+    gap = law._gap_known(np.zeros(2), np.array([1.0, 0.0]), r, 0.3, table.obstacles, 30.0)
     assert gap == pytest.approx(5.0 - math.sqrt((0.7 + r) ** 2 - 0.4**2), abs=0.02)
-    assert law._gap_told(np.zeros(2), np.array([0.0, 1.0]), r, 0.3, table.obstacles, 30.0) == math.inf
+    assert law._gap_known(np.zeros(2), np.array([0.0, 1.0]), r, 0.3, table.obstacles, 30.0) == math.inf
 
 
 def test_estimate_is_filterpys_on_the_same_model():
@@ -303,7 +303,7 @@ def test_obstacles_that_touch_hold_the_goal_or_grow_stale_stop_the_base():
     lab.tick()
     assert "goal_in_obstacle" in lab.faults
     lab.tick(goal=goal_at(10.0, 0.1))
-    assert "inside obstacle c" in lab.m.verdict
+    assert "inside obstacle c" in lab.m.refusal
     moving = crate._replace(position=np.array([20.0, 5.0, 0.3]), velocity=np.array([0.1, 0.0, 0.0]))
     lab.tick(obstacles=(ObstacleEdit("*", None), ObstacleEdit("m", moving)))
     assert lab.run(1.0, lambda: "feed_stale" in lab.faults)
@@ -314,14 +314,14 @@ def test_obstacles_that_touch_hold_the_goal_or_grow_stale_stop_the_base():
 def test_goals_that_make_no_sense_are_refused_with_the_reason():
     lab = BaseLab()
     lab.tick(goal=goal_at(5.0, 0.0))
-    assert "not possible in state IDLE" in lab.m.verdict
+    assert "not possible in state IDLE" in lab.m.refusal
     lab.armed()
     lab.tick(goal=goal_at(400.0, 400.0))
-    assert "reach" in lab.m.verdict
+    assert "reach" in lab.m.refusal
     lab.tick(goal=goal_at(math.nan, 0.0))
-    assert "finite" in lab.m.verdict
+    assert "finite" in lab.m.refusal
     lab.tick(Verb.RECOVER)
-    assert "no joint limits" in lab.m.verdict
+    assert "no joint limits" in lab.m.refusal
 
 
 def test_a_log_replays_to_the_same_bytes_and_nothing_compiles_after_warm(tmp_path):

@@ -355,13 +355,13 @@ def test_another_vehicle_that_is_heard_first_is_passed_over(tmp_path):
     link = open_link(load(any_id), any_id, InProcess(lambda packets: [copter, *double.exchange(packets)], 0.02))
     link.handshake()
     assert link.vehicle == (1, 1)
-    assert any("passed over" in line for line in link.news)
+    assert any("passed over" in line for line in link.events)
 
 
 def test_denied_streams_are_told_and_what_comes_unasked_is_driven_by():
     lab = BaseLab(inject=["rates_denied@0.0"])
     assert lab.link.talk.rates == {}
-    assert any("no stream was granted" in line for line in lab.link.news)
+    assert any("no stream was granted" in line for line in lab.link.events)
     lab.armed()
     assert lab.arrive(8.0, 1.0)
     truth = lab.rover.truth()

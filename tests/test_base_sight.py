@@ -45,7 +45,7 @@ def test_a_scan_comes_from_any_component_of_the_vehicle_and_from_one_while_two_s
     cells = [400] * 72
     f = fed(lab, obstacle_distance(cells, 5, 5.0, 0.0, 12, component=196))
     assert f.scans == 0  # 195 speaks
-    assert any("196" in line and "name both" in line for line in lab.link.news)
+    assert any("196" in line and "name both" in line for line in lab.link.events)
     f = fed(lab, obstacle_distance(cells, 5, 5.0, 0.0, 12, component=195))
     assert f.scans == 1
 
@@ -168,7 +168,7 @@ def test_what_was_seen_counts_for_its_time_and_its_place_moves_with_the_window()
     step = -2.0 * math.pi / 72
     clear = np.full(72, np.inf)
     clear[18] = -1.0  # one sector to the right knows nothing
-    chart = occupancy.looked(chart, occupancy.Look(np.zeros(2), 0.0, step, clear, 12.0), 100)
+    chart = occupancy.integrate_scan(chart, occupancy.PlacedScan(np.zeros(2), 0.0, step, clear, 12.0), 100)
     chart = occupancy.stood(chart, np.zeros(2), 0.5, 100)
     ahead, right = np.array([1.0, 0.0]), np.array([0.0, -1.0])
     gap, first = occupancy.seen_ahead(chart, np.zeros(2), ahead, 0.5, 3.0, 99)
@@ -287,7 +287,7 @@ def test_our_own_hold_is_nobodys_mode_and_one_reset_is_enough():
     assert lab.run(8.0, lambda: lab.rover.autopilot.mode == 4)
     lab.run(2.0)
     lab.tick(Verb.RESET)
-    assert not lab.m.verdict
+    assert not lab.m.refusal
     lab.run(2.0)
     assert lab.m.state == State.IDLE
     assert "mode_taken" not in lab.seen

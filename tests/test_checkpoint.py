@@ -156,8 +156,8 @@ def test_whatever_stands_in_a_checkpoint_it_is_taken_or_refused(place: tuple[Any
     except ValueError:
         return
     # what was taken fits: the tick can go on with it
-    shapes = [np.shape(getattr(found.memory, name)) for name in ("good", "qdd", "sent", "rho", "watch")]
-    assert shapes == [np.shape(getattr(template, name)) for name in ("good", "qdd", "sent", "rho", "watch")]
+    shapes = [np.shape(getattr(found.memory, name)) for name in ("good", "qdd", "sent", "rho", "encoder_monitors")]
+    assert shapes == [np.shape(getattr(template, name)) for name in ("good", "qdd", "sent", "rho", "encoder_monitors")]
 
 
 # ---- replay from them

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rtctl.arm import law as law_module
-from rtctl.arm import limits, osc, pipe, servo_level, session
+from rtctl.arm import limits, osc, pipe, servo_level, supervision
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.control import supervisor
@@ -331,7 +331,7 @@ def starts_where_it_is() -> bool:
 
 def test_switching_on_again_begins_from_where_the_arm_is(monkeypatch: Patch):
     assert starts_where_it_is()
-    monkeypatch.setattr(session, "held_here", lambda robot, m: m)
+    monkeypatch.setattr(supervision, "held_here", lambda robot, m: m)
     assert not starts_where_it_is()
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
-from rtctl.types import Cut
+from rtctl.types import LimitFlag
 
 N, DT = 3, 1e-3
 MAX, RATE, D = np.array([80.0, 40.0, 10.0]), np.array([1000.0, 1000.0, 300.0]), np.array([10.0, 5.0, 1.0])
@@ -30,7 +30,7 @@ def test_a_torque_reference_that_is_not_finite_gives_zero_torque_there(reference
     p = limit_torque(TorqueParts(np.ones(N), np.zeros(N)), np.zeros(N), reference, BOUNDS, DT)
     bad = ~np.isfinite(reference)
     assert (p.tau[bad] == 0.0).all()
-    assert bool(p.cut & Cut.NON_FINITE) == bool(bad.any())
+    assert bool(p.flags & LimitFlag.NON_FINITE) == bool(bad.any())
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -40,7 +40,7 @@ def test_one_bad_number_damps_every_joint(bad, where):
     parts[where][1] = bad
     qd = np.array([0.1, -0.1, 0.01])
     p = limit_torque(TorqueParts(**parts), qd, -D * qd, BOUNDS, DT)
-    assert p.cut & Cut.NON_FINITE
+    assert p.flags & LimitFlag.NON_FINITE
     np.testing.assert_allclose(p.tau, [-1.0, 0.5, -0.01])
 
 
@@ -58,7 +58,7 @@ def test_motion_gives_way_before_what_must_be_kept(drive, keep):
 def test_a_torque_within_all_bounds_is_not_touched(tau):
     p = limit_torque(TorqueParts(tau, np.zeros(N)), np.zeros(N), tau, BOUNDS, DT)
     np.testing.assert_array_equal(p.tau, tau)
-    assert p.cut == 0
+    assert p.flags == 0
 
 
 def test_the_slew_starts_from_what_the_drive_really_applies():
@@ -75,7 +75,7 @@ def test_a_step_that_is_too_large_is_shortened_on_every_joint_alike(wanted, refe
     away = np.clip(wanted, -MAX, MAX) - start
     share = min([1.0, *(step[i] / abs(away[i]) for i in range(N) if abs(away[i]) > step[i])])
     np.testing.assert_allclose(p.tau, start + share * away, atol=1e-9)
-    assert bool(p.cut & Cut.SLEW) == (share < 1.0)
+    assert bool(p.flags & LimitFlag.SLEW) == (share < 1.0)
 
 
 def test_a_joint_without_a_reference_does_not_hold_up_the_others():

@@ -152,7 +152,7 @@ def run_after_warming() -> None:
         for said in MESSAGES:
             message = decode(json.dumps(said).encode())
             here.step(request_of(message, bounds, lambda: quat_of(here.memory.tip.R).tolist()))
-            assert not here.memory.verdict
+            assert not here.memory.refusal
             here.run(0.01)
     late = {name: kernel.signatures[before[name] :] for name, kernel in kernels.items()}
     assert not any(late.values()), {name: found for name, found in late.items() if found}

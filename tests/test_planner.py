@@ -14,7 +14,7 @@ import pytest
 from rtctl import design as cfg
 from rtctl.app import daemon
 from rtctl.app.plan import plan
-from rtctl.app.stream import REPLANS, Follower, Seen
+from rtctl.app.stream import REPLANS, ArmStatus, GoalStream
 from rtctl.arm.task import between
 from rtctl.cli import main
 from rtctl.cli.planning import message_of, obstacles_told
@@ -198,44 +198,44 @@ class Plans:
         return [to(0.1 * k, 0.0, 0.5)._replace(posture=np.full(3, 0.1 * k)) for k in range(1, 4)]
 
 
-def seen(x: float, status: str = "moving", q: float | None = None) -> Seen:
-    return Seen(status, "wall at hand", np.array([x, 0.0, 0.5]), np.full(3, x if q is None else q))
+def seen(x: float, status: str = "moving", q: float | None = None) -> ArmStatus:
+    return ArmStatus(status, "wall at hand", np.array([x, 0.0, 0.5]), np.full(3, x if q is None else q))
 
 
-def given(follower: Follower, view: Seen) -> float | None:
-    goal = follower.next(view)
+def given(stream: GoalStream, view: ArmStatus) -> float | None:
+    goal = stream.next(view)
     return None if goal is None else float(goal.position[0])
 
 
 def test_sub_goals_are_passed_near_and_the_last_one_is_arrived_at():
-    follower = Follower(Plans(), np.zeros(3))
-    assert given(follower, seen(0.0)) == 0.1
-    assert given(follower, seen(0.02)) is None
-    assert given(follower, seen(0.05, q=0.9)) is None  # the elbow is not there yet
-    assert given(follower, seen(0.05)) == 0.2
-    assert given(follower, seen(0.15)) == pytest.approx(0.3)
-    assert given(follower, seen(0.29)) is None
-    assert follower.over == ""
-    assert given(follower, seen(0.3, "arrived")) is None
-    assert follower.over == "arrived"
+    stream = GoalStream(Plans(), np.zeros(3))
+    assert given(stream, seen(0.0)) == 0.1
+    assert given(stream, seen(0.02)) is None
+    assert given(stream, seen(0.05, q=0.9)) is None  # the elbow is not there yet
+    assert given(stream, seen(0.05)) == 0.2
+    assert given(stream, seen(0.15)) == pytest.approx(0.3)
+    assert given(stream, seen(0.29)) is None
+    assert stream.over == ""
+    assert given(stream, seen(0.3, "arrived")) is None
+    assert stream.over == "arrived"
 
 
 @pytest.mark.parametrize("status", ["local_minimum", "limited", "escaping"])
 def test_what_holds_the_arm_is_planned_around_from_where_it_is_a_bounded_number_of_times(status: str):
     plans = Plans()
-    follower = Follower(plans, np.zeros(3), seed=7)
-    follower.next(seen(0.0))
+    stream = GoalStream(plans, np.zeros(3), seed=7)
+    stream.next(seen(0.0))
     for k in range(REPLANS):
-        assert given(follower, seen(0.3, status)) == 0.1
+        assert given(stream, seen(0.3, status)) == 0.1
         assert plans.asked[-1][0].tolist() == [0.3] * 3
         assert plans.asked[-1][1] == 8 + k
-        assert status in follower.news[-1]
-    assert given(follower, seen(0.3, status)) is None
-    assert follower.over == f"{status}: wall at hand"
+        assert status in stream.events[-1]
+    assert given(stream, seen(0.3, status)) is None
+    assert stream.over == f"{status}: wall at hand"
 
 
 def test_a_plan_that_fails_on_the_way_ends_it_with_both_reasons():
-    follower = Follower(Plans(fail_from=1), np.zeros(3))
-    follower.next(seen(0.0))
-    assert given(follower, seen(-0.1, "limited")) is None
-    assert follower.over == "limited: wall at hand; plan: no path"
+    stream = GoalStream(Plans(fail_from=1), np.zeros(3))
+    stream.next(seen(0.0))
+    assert given(stream, seen(-0.1, "limited")) is None
+    assert stream.over == "limited: wall at hand; plan: no path"

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.arm import session
+from rtctl.arm import supervision
 from rtctl.arm.law import prepared
-from rtctl.arm.session import SETTLE
+from rtctl.arm.supervision import SETTLE
 from rtctl.control import supervisor
 from rtctl.control.supervisor import EVENT_OF
 from rtctl.types import Drive, ObstacleEdit, Request, Severity, State, Task, Verb
@@ -86,7 +86,7 @@ def test_drives_that_do_not_enable_are_given_up_on():
     arm = idle()
     arm.ask(Verb.ARM)
     off = {"drive": np.zeros(7, np.int64)}
-    arm.ticks(round(session.ENABLE_TIMEOUT / DT) - 5, **off)
+    arm.ticks(round(supervision.ENABLE_TIMEOUT / DT) - 5, **off)
     assert arm.state() == State.ARMED
     arm.ticks(10, **off)
     assert (arm.state(), arm.drive()) == (State.IDLE, Drive.DISABLE)
@@ -137,8 +137,8 @@ def test_a_verb_in_the_wrong_state_is_refused_with_the_state_and_changes_nothing
         return
     arm = Standing(state)
     arm.memory = arm.memory._replace(reaction=Severity.SS2 if state == State.SAFE_STOP else Severity.NONE)
-    verdict = arm.ask(verb)
-    assert verdict == f"{verb.name.lower()}: not possible in state {state.name}"
+    refusal = arm.ask(verb)
+    assert refusal == f"{verb.name.lower()}: not possible in state {state.name}"
     assert arm.state() == state
 
 
@@ -146,7 +146,7 @@ def test_a_verdict_is_that_of_its_own_tick():
     arm = idle()
     assert arm.ask(Verb.RESET) == ""
     assert arm.ask(Verb.STOP) != ""
-    assert arm.tick().verdict == ""
+    assert arm.tick().refusal == ""
 
 
 @pytest.mark.parametrize("state", [s for s in STATES if s != State.RUN])
@@ -154,7 +154,7 @@ def test_a_goal_is_for_a_running_arm(state: State):
     arm = Standing(state)
     arm.memory = arm.memory._replace(reaction=Severity.SS2 if state == State.SAFE_STOP else Severity.NONE)
     memory = arm.tick(Request(goal=goal(arm.memory, [0.5, 0.2, 0.5])))
-    assert memory.verdict == f"goal: not possible in state {state.name}"
+    assert memory.refusal == f"goal: not possible in state {state.name}"
     assert memory.goal is None
 
 
@@ -163,7 +163,7 @@ def test_a_refused_goal_leaves_the_one_before_it():
     arm.tick(Request(goal=goal(arm.memory, [0.5, 0.2, 0.5])))
     for bad in ([np.nan, 0.0, 0.5], [5.0, 0.0, 0.5]):
         memory = arm.tick(Request(goal=goal(arm.memory, bad)))
-        assert memory.verdict.startswith("goal: ")
+        assert memory.refusal.startswith("goal: ")
         assert memory.goal is not None
         np.testing.assert_array_equal(memory.goal.position, [0.5, 0.2, 0.5])
 
@@ -172,7 +172,7 @@ def test_a_goal_inside_an_obstacle_is_refused_by_name():
     arm = running()
     crate = sphere("crate", [0.5, 0.3, 0.5], 0.1)
     memory = arm.tick(Request(goal=goal(arm.memory, [0.5, 0.25, 0.5]), obstacles=(ObstacleEdit("crate", crate),)))
-    assert memory.verdict == "goal: lies 0.050 m inside obstacle crate"
+    assert memory.refusal == "goal: lies 0.050 m inside obstacle crate"
 
 
 def test_stop_holds_the_arm_until_reset():
@@ -204,7 +204,7 @@ def test_beyond_a_limit_arming_is_refused_and_recovering_is_not():
     arm.ticks(round(SETTLE / DT) + 2)
     assert (arm.state(), arm.memory.recovering) == (State.RUN, True)
     assert "outside_limits" not in arm.present
-    assert "beyond its limits" in arm.tick(Request(goal=goal(arm.memory, [0.4, 0.2, 0.5]))).verdict
+    assert "beyond its limits" in arm.tick(Request(goal=goal(arm.memory, [0.4, 0.2, 0.5]))).refusal
     model = arm.memory.model
     qdd = model.A_inv @ (arm.memory.sent[0] - model.g)
     assert qdd[3] > 0.0  # inward
@@ -214,7 +214,7 @@ def test_beyond_a_limit_arming_is_refused_and_recovering_is_not():
 def test_where_nothing_is_beyond_a_limit_there_is_nothing_to_recover_from():
     for q in (PANDA_HOME, at_limit()):
         arm = idle(q)
-        assert arm.ask(Verb.RECOVER) == f"recover: {session.INSIDE}"
+        assert arm.ask(Verb.RECOVER) == f"recover: {supervision.INSIDE}"
         arm.ticks(round(SETTLE / DT) + 2)
         assert (arm.state(), arm.drive(), arm.memory.recovering) == (State.IDLE, Drive.DISABLE, False)
         assert arm.ask(Verb.ARM) == ""
@@ -234,7 +234,7 @@ def test_disarming_brings_a_moving_arm_to_rest_before_it_lets_go():
     arm.ask(Verb.DISARM, **MOVING)
     swing(arm, 1000)
     assert (arm.state(), arm.drive()) == (State.STOPPING, Drive.TORQUE)
-    arm.ticks(round(session.REST_HOLD / DT) - 2)
+    arm.ticks(round(supervision.REST_HOLD / DT) - 2)
     assert arm.drive() == Drive.TORQUE
     arm.ticks(5)
     assert (arm.state(), arm.drive()) == (State.IDLE, Drive.DISABLE)
@@ -243,7 +243,7 @@ def test_disarming_brings_a_moving_arm_to_rest_before_it_lets_go():
 def test_an_arm_that_is_kept_moving_is_let_go_after_its_time():
     arm = running()
     arm.ask(Verb.DISARM)
-    swing(arm, round(session.STOP_TIME / DT) - 5)
+    swing(arm, round(supervision.STOP_TIME / DT) - 5)
     assert arm.state() == State.STOPPING
     swing(arm, 10)
     assert arm.state() in (State.IDLE, State.SAFE_STOP)

@@ -13,7 +13,7 @@ import pytest
 
 from rtctl import design as cfg
 from rtctl.app.sim import simulate
-from rtctl.types import F64, Cut, State, Status
+from rtctl.types import F64, LimitFlag, State, Status
 from tests.arms import PANDA_HOME
 from tests.lab import PANDA, ROOT, Run, changed, play, robot
 
@@ -197,7 +197,7 @@ def test_nothing_that_is_asked_makes_it_violent(name: str):
         if run.record[field].dtype.kind == "f" and field != "rho":  # infinite where there is no obstacle
             assert np.isfinite(run.record[field]).all(), field
     assert not np.isnan(run.record["rho"]).any()
-    assert not (run.record["cut"] & Cut.NON_FINITE).any()
+    assert not (run.record["cut"] & LimitFlag.NON_FINITE).any()
     assert run.figures["max_torque_ratio"] <= 1.0
     assert run.figures["max_torque_rate_ratio"] <= 1.0 + 1e-9
     assert run.figures["max_joint_speed_ratio"] <= 1.0

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rtctl.types import Cut, State
+from rtctl.types import LimitFlag, State
 from tests.arms import PANDA_HOME
 from tests.lab import PANDA, Run, play
 
@@ -115,7 +115,7 @@ def judged(way: Way, done: Run) -> None:
 @pytest.mark.parametrize("name", PANDA_WAYS)
 def test_seven_joints_pass_or_approach_a_singularity(name: str):
     done = run(name, PANDA)
-    assert (done.record["cut"] & Cut.SINGULAR).any()
+    assert (done.record["cut"] & LimitFlag.SINGULAR).any()
     judged(PANDA_WAYS[name], done)
 
 

@@ -15,7 +15,7 @@ from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of
 from rtctl.spec.goal import goal_from
 from rtctl.spec.scenario import GoalTable, parse_goal
-from rtctl.types import F64, Cut, Goal, Request, Status, Task
+from rtctl.types import F64, Goal, LimitFlag, Request, Status, Task
 from tests.arms import PANDA_HOME
 from tests.lab import Run, Standing, play
 from tests.test_osc import P, arm
@@ -170,7 +170,7 @@ def test_each_part_of_a_pose_is_reached_and_told_so():
         assert run.record["status"][row] == Status.ARRIVED
         assert run.record["error"][row] < 1e-3
         assert run.record["error_rot"][row] < 5e-3
-    assert not (run.record["cut"] & Cut.SINGULAR).any()
+    assert not (run.record["cut"] & LimitFlag.SINGULAR).any()
 
 
 def test_the_truth_agrees_with_what_was_asked_and_the_rest_was_left_alone():
@@ -247,7 +247,7 @@ def test_a_planar_arm_moves_in_its_plane_and_is_not_called_singular_for_the_rest
     run = play({"duration_s": 4.5, "goal": goals}, planar(tmp_path, '["x", "y"]'))
     assert run.figures["arrived"]
     assert run.figures["final_error_m"] < 1e-3
-    assert not (run.record["cut"] & Cut.SINGULAR).any()
+    assert not (run.record["cut"] & LimitFlag.SINGULAR).any()
     assert {name for _, name, _ in run.events} == {"state", "moving", "arrived"}
 
 

@@ -20,7 +20,7 @@ from rtctl.log import make_header, read
 from rtctl.log.header import meshes_to_files
 from rtctl.log.record.requests import encode_request
 from rtctl.log.record.scene import Scene
-from rtctl.types import Cut, Goal, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
+from rtctl.types import Goal, LimitFlag, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
 from tests.arms import panda
 from tests.base_lab import ROVER
 from tests.bodies import SURFACES, known, sampled
@@ -289,7 +289,7 @@ def test_layouts_show_what_logs_have(name: str, arm_log: Path, rover_log: Path):
     if name.endswith(".json"):
         assert {"/scene", "/tf", "/log", "/event"} <= topics
         for path, label in re.findall(r'"value": "/tick\.(\w+)",\s*"label": "\w+: ([^"]+)"', text):
-            kind = {"state": State, "severity": Severity, "cut": Cut}[path]
+            kind = {"state": State, "severity": Severity, "cut": LimitFlag}[path]
             for number, words in (pair.split(" ", 1) for pair in label.split(", ")):
                 member = kind(int(number))
                 assert words == MEANING.get(member.name, member.name.lower().replace("_", " "))

@@ -38,7 +38,7 @@ STAGES = {
     "servo": "servo level, a call",
     "_evaluated": "parameter level",
     "_perceived": "edit obstacles",
-    "supervised": "supervise",
+    "supervise": "supervise",
     "with_goal": "take goals",
     "_diagnosed": "diagnose",
 }

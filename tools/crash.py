@@ -213,7 +213,7 @@ def fill(folder: Path) -> dict[str, Any]:
             if rig.turn(Request()).record["state"][0] == State.IDLE:
                 break
         rig.turn(Request(Verb.ARM))
-        verdict, state = rig.servo.memory.verdict, rig.servo.memory.state.name
+        refusal, state = rig.servo.memory.refusal, rig.servo.memory.state.name
         stats = rig.recorder.stats()
         rig.close()
     files = sorted(folder.glob("*.mcap"))
@@ -221,7 +221,7 @@ def fill(folder: Path) -> dict[str, Any]:
         "tick_when_full": full,
         "tick_after": before,
         "went_on": went_on,
-        "arming": verdict,
+        "arming": refusal,
         "state": state,
         "lost": stats.lost,
         "files": [path.name for path in files],

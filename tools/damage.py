@@ -84,7 +84,7 @@ def look(path: Path, out: Path) -> None:
         lambda: traffic(read_run(path)),
         lambda: mavlink.listing(read_run(path)),
         lambda: export.to_tlog(read_run(path), out / "t.tlog", quiet),
-        lambda: Tail(path).news(),
+        lambda: Tail(path).read_on(),
         lambda: mend(path, out / "mended.mcap"),
         lambda: recover(path.rename(path.with_name(path.name + ".open"))),
     ):

@@ -95,7 +95,7 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
         servo.events.clear()
         if (slot + 1) % every == 0:
             done = sum(s.goals for s in samples)
-            waiting = len(link.news) + len(link.view.asked) + len(link.talk._waiting) + len(rover.autopilot.outbox)
+            waiting = len(link.events) + len(link.view.asked) + len(link.talk._waiting) + len(rover.autopilot.outbox)
             minute = len(samples) + 1
             samples.append(
                 Sample(minute, sent / STEP, _resident(), waiting, goals - done, 1e3 * float(np.percentile(times, 99)))

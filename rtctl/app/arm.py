@@ -76,8 +76,8 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
 def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> list[Event]:
     """Return what changed in this tick, as (name, detail): states, faults, statuses, refusals."""
     found = []
-    if after.verdict:
-        found.append(("rejected", after.verdict))
+    if after.refusal:
+        found.append(("rejected", after.refusal))
     fresh = after.in_force & ~before.in_force
     if fresh:
         found.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))

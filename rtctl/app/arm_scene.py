@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rtctl.app.stream import Follower, Seen
+from rtctl.app.stream import ArmStatus, GoalStream
 from rtctl.app.tally import Leg, number, of_way
 from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
@@ -89,18 +89,18 @@ class ArmFeed:
     def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: ArmTally) -> None:
         self.robot, self.simulator, self.tally = robot, simulator, tally
         self.pending = list(scenario.goal)
-        self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its verdict not yet seen
+        self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its refusal not yet seen
         self.last: dict[str, Shape | None] = {}
         self.frames = 0
         self.planned, self.seed = scenario.planner, scenario.seed
         self.world: World = obstacle_table.empty(robot.slots, robot.meshes)  # as the controller knows it now
-        self.follower: Follower | None = None
+        self.stream: GoalStream | None = None
         self.events: list[tuple[float, str, str]] = []  # of the planner; (time [s], name, detail)
 
     def request(self, m: Memory, truth: Truth) -> Request:
         """Return the request of this period."""
         self.world = m.world
-        if self.waiting is not None and not m.verdict:
+        if self.waiting is not None and not m.refusal:
             self.tally.legs.append(Leg(*self.waiting))
         self.waiting = None
         verb = Verb.NONE
@@ -114,8 +114,8 @@ class ArmFeed:
             self.waiting = (goal, truth.time, truth.tip.copy())
             if self.planned:
                 goal = self._first(goal, m, truth)
-        elif self.follower is not None and m.state == State.RUN:
-            goal = self._next(self.follower, m, truth)
+        elif self.stream is not None and m.state == State.RUN:
+            goal = self._next(self.stream, m, truth)
         return Request(verb, goal, self._seen(truth))
 
     def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
@@ -123,24 +123,24 @@ class ArmFeed:
         from rtctl.app.plan import plan  # heavy, and few scenarios plan
 
         try:
-            self.follower = Follower(
+            self.stream = GoalStream(
                 # bounded by what it looks at alone: a slow machine must not find another way
                 lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed, within=np.inf),
                 m.joints.q,
                 self.seed,
             )
         except PlanError as error:
-            self.follower = None
+            self.stream = None
             self.events.append((truth.time, "no_plan", str(error)))
             return goal
-        return self._next(self.follower, m, truth) or goal
+        return self._next(self.stream, m, truth) or goal
 
-    def _next(self, follower: Follower, m: Memory, truth: Truth) -> Goal | None:
-        goal = follower.next(Seen(m.status.name.lower(), "; ".join(m.blocked_by), m.tip.x, m.joints.q))
-        self.events += [(truth.time, "planned", text) for text in follower.news]
-        follower.news.clear()
-        if follower.over:
-            self.follower = None
+    def _next(self, stream: GoalStream, m: Memory, truth: Truth) -> Goal | None:
+        goal = stream.next(ArmStatus(m.status.name.lower(), "; ".join(m.blocked_by), m.tip.x, m.joints.q))
+        self.events += [(truth.time, "planned", text) for text in stream.events]
+        stream.events.clear()
+        if stream.over:
+            self.stream = None
         return goal
 
     def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:

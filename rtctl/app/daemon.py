@@ -181,7 +181,7 @@ def _loop(process: Process[R, M, F, C], slots: Iterator[Slot]) -> int:
             request = request._replace(verb=Verb.TERM)
             service.stopping()
         servo.turn(slot, request)
-        console.answer(not servo.memory.verdict, servo.memory.verdict)
+        console.answer(not servo.memory.refusal, servo.memory.refusal)
         recorder.beat(time.monotonic_ns())
         service.kick(slot.slot)
         for now, name, detail in servo.events[told:]:

@@ -55,8 +55,8 @@ def load(path: Path, timeout: float | None = None) -> Setup[Base, BaseMemory, Ba
 def events(base: Base, before: BaseMemory, after: BaseMemory, feedback: BaseFeedback) -> list[Event]:
     """Return what changed in this tick, as (name, detail): states, faults, statuses, refusals."""
     found: list[Event] = []
-    if after.verdict:
-        found.append(("rejected", after.verdict))
+    if after.refusal:
+        found.append(("rejected", after.refusal))
     fresh = after.in_force & ~before.in_force
     if fresh:
         found.append(("fault", faults.TABLE.describe(fresh, after.state) + _numbers(fresh, after)))

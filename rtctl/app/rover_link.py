@@ -26,7 +26,7 @@ class RoverLink(MavLink):
     @property
     def said(self) -> deque[str]:
         """What the vehicle told people."""
-        return self.news
+        return self.events
 
     def greet(self, lockstep: bool, say: Say | None = None, ended: Callable[[], bool] = never) -> BaseFeedback:
         """Return the feedback that the handshake leaves. Raises HandshakeError, AbsentError, StoppedError."""

@@ -104,7 +104,7 @@ class RoverFeed:
 
     def request(self, m: BaseMemory, truth: RoverTruth) -> Request:
         """Return the request of this period."""
-        if self.waiting is not None and not m.verdict:
+        if self.waiting is not None and not m.refusal:
             self.tally.legs.append(Leg(*self.waiting))
         self.waiting = None
         verb = Verb.ARM if m.state == State.IDLE and m.tick < 0 else Verb.NONE

@@ -19,7 +19,7 @@ HELD = frozenset(("local_minimum", "escaping", "limited", "shadowed", "singular"
 Plan = Callable[[F64, int], list[Goal]]
 
 
-class Seen(NamedTuple):
+class ArmStatus(NamedTuple):
     """What the controller says of itself."""
 
     status: str  # of types.Status, in small letters
@@ -28,7 +28,7 @@ class Seen(NamedTuple):
     q: F64  # (n,) [rad]
 
 
-class Follower:
+class GoalStream:
     """The sub-goals of one far goal, given one by one."""
 
     def __init__(self, plan: Plan, q: F64, seed: int = 0) -> None:
@@ -37,10 +37,10 @@ class Follower:
         self.goals = plan(q, seed)
         self.at = -1  # the sub-goal given last
         self.replans = 0
-        self.news: list[str] = [f"{len(self.goals)} sub-goals"]
+        self.events: list[str] = [f"{len(self.goals)} sub-goals"]
         self.over = ""  # how it ended: "arrived", or what held the arm
 
-    def next(self, seen: Seen) -> Goal | None:
+    def next(self, seen: ArmStatus) -> Goal | None:
         """Return the sub-goal to give now, None to let the arm go on."""
         if self.over:
             return None
@@ -58,7 +58,7 @@ class Follower:
             self.over = f"shadowed: {seen.detail}"
         return None
 
-    def _passed(self, seen: Seen) -> bool:
+    def _passed(self, seen: ArmStatus) -> bool:
         goal = self.goals[self.at]
         if float(np.linalg.norm(seen.x - goal.position)) > PASS:
             return False
@@ -69,7 +69,7 @@ class Follower:
         self.at = at
         return self.goals[at]
 
-    def _replanned(self, seen: Seen) -> Goal | None:
+    def _replanned(self, seen: ArmStatus) -> Goal | None:
         why = f"{seen.status}: {seen.detail}" if seen.detail else seen.status
         if self.replans == REPLANS:
             self.over = why
@@ -80,5 +80,5 @@ class Follower:
         except PlanError as error:
             self.over = f"{why}; {error}"
             return None
-        self.news.append(f"planned anew after {why}: {len(self.goals)} sub-goals")
+        self.events.append(f"planned anew after {why}: {len(self.goals)} sub-goals")
         return self._given(0)

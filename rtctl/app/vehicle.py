@@ -60,7 +60,7 @@ class Remembered(Protocol):
     @property
     def in_force(self) -> int: ...  # bits of the faults
     @property
-    def verdict(self) -> str: ...  # why this tick's request was refused, '' when it was not
+    def refusal(self) -> str: ...  # why this tick's request was refused, '' when it was not
     @property
     def done(self) -> bool: ...  # nothing more to do: the daemon may leave
     @property

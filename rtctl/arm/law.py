@@ -41,11 +41,11 @@ from rtctl.arm.osc import (
 from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
 from rtctl.arm.scaling import scale_drive_to_limits, scale_to_limits
 from rtctl.kernel import kernel, leaf_kernel
-from rtctl.types import F64, I32, I64, Cut, Record, RecordRow
+from rtctl.types import F64, I32, I64, LimitFlag, Record, RecordRow
 from rtctl.world.primitives import Obstacles
 
-_CAP, _SPEED, _SINGULAR = (int(c) for c in (Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR))
-_SCALED = int(Cut.MOTION_SCALED)
+_CAP, _SPEED, _SINGULAR = (int(c) for c in (LimitFlag.FIELD_CAP, LimitFlag.SPEED, LimitFlag.SINGULAR))
+_SCALED = int(LimitFlag.MOTION_SCALED)
 
 
 REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
@@ -72,7 +72,7 @@ class Law(NamedTuple):
     seen: F64  # (4 K,) rho, then force, below
     nearest: I32  # (K,) PSP
     rho_self: float  # [m]
-    cut: int  # Cut.FIELD_CAP, Cut.SPEED, Cut.SINGULAR, Cut.MOTION_SCALED
+    flags: int  # LimitFlag.FIELD_CAP, LimitFlag.SPEED, LimitFlag.SINGULAR, LimitFlag.MOTION_SCALED
 
     def row(self, i: int) -> F64:
         """Return a row (n,) [Nm] of the torques."""
@@ -491,7 +491,7 @@ def law(
     memory: WorkMemory,
     out: Outputs,
 ) -> tuple[float, int]:
-    """Write the torques of a tick into `out`; return the least distance between links [m], and Law.cut.
+    """Write the torques of a tick into `out`; return the least distance between links [m], and Law.flags.
 
     The whole law is one kernel without an array of its own, so that nothing is counted or allocated on the way.
     """

@@ -9,9 +9,11 @@ import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import largest
-from rtctl.types import F64, Cut, Feedback
+from rtctl.types import F64, Feedback, LimitFlag
 
-_NON_FINITE, _MAGNITUDE, _SLEW, _SCALED = (int(c) for c in (Cut.NON_FINITE, Cut.MAGNITUDE, Cut.SLEW, Cut.MOTION_SCALED))
+_NON_FINITE, _MAGNITUDE, _SLEW, _SCALED = (
+    int(flag) for flag in (LimitFlag.NON_FINITE, LimitFlag.MAGNITUDE, LimitFlag.SLEW, LimitFlag.MOTION_SCALED)
+)
 
 
 class TorqueParts(NamedTuple):
@@ -35,7 +37,7 @@ class Limited(NamedTuple):
 
     tau_wanted: F64  # (n,) [Nm] the law's sum, before magnitude and slew
     tau: F64  # (n,) [Nm]
-    cut: int  # types.Cut bits
+    flags: int  # types.LimitFlag bits
     scale: float  # fraction of the driving torque that was left, 1 = all
 
 
@@ -76,27 +78,27 @@ def slew_follows_echo(reference: F64, tau_sent: F64, tau_lsb: F64) -> bool:
 def _limit_magnitude(torque: TorqueParts, tau_max: F64) -> Limited:
     """Scale the driving torque so that the sum (n,) [Nm], which is finite, stays within tau_max (n,) [Nm]."""
     drive, keep = torque
-    cut, scale = 0, 1.0
+    flags, scale = 0, 1.0
     for i in range(drive.shape[0]):
         # the largest s in [0, 1] with |keep + s drive| <= tau_max on this joint
         margin = tau_max[i] - keep[i] if drive[i] > 0.0 else -tau_max[i] - keep[i]
         if abs(keep[i] + scale * drive[i]) > tau_max[i] and drive[i] != 0.0:
             scale = min(scale, max(0.0, margin / drive[i]))
     if scale < 1.0:
-        cut |= _SCALED
-    return Limited(drive + keep, keep + scale * drive, cut, scale)
+        flags |= _SCALED
+    return Limited(drive + keep, keep + scale * drive, flags, scale)
 
 
 @kernel
 def _limit_slew(tau: F64, reference: F64, bounds: TorqueBounds, dt: float) -> int:
     """Bound a torque (n,) [Nm] in place, first each joint's magnitude, then the step from the reference."""
     tau_max, tau_rate = bounds.tau_max, bounds.tau_rate
-    n, cut = tau.shape[0], 0
+    n, flags = tau.shape[0], 0
     for i in range(n):
         if abs(tau[i]) > tau_max[i]:
             # rounding of the scaled sum may pass the bound by an ulp: that is not worth reporting
             if abs(tau[i]) > tau_max[i] * (1.0 + 1e-9):
-                cut |= _MAGNITUDE
+                flags |= _MAGNITUDE
             tau[i] = tau_max[i] if tau[i] > 0.0 else -tau_max[i]
     share = 1.0  # of the step that every joint can take: all slow down as one, so that the direction stays
     for i in range(n):
@@ -104,16 +106,16 @@ def _limit_slew(tau: F64, reference: F64, bounds: TorqueBounds, dt: float) -> in
             step = abs(tau[i] - min(max(reference[i], -tau_max[i]), tau_max[i]))
             if step * share > tau_rate[i] * dt:
                 share = tau_rate[i] * dt / step
-                cut |= _SLEW
+                flags |= _SLEW
     for i in range(n):
         if not np.isfinite(reference[i]):
-            cut |= _NON_FINITE
+            flags |= _NON_FINITE
             tau[i] = 0.0
             continue
         start = min(max(reference[i], -tau_max[i]), tau_max[i])
         step = min(max(share * (tau[i] - start), -tau_rate[i] * dt), tau_rate[i] * dt)
         tau[i] = min(max(start + step, -tau_max[i]), tau_max[i])
-    return cut
+    return flags
 
 
 @kernel
@@ -130,8 +132,8 @@ def limit_torque(torque: TorqueParts, qd: F64, reference: F64, bounds: TorqueBou
             if np.isfinite(qd[i]):
                 wanted[i] = -bounds.damping[i] * qd[i]
         limited = Limited(wanted, wanted.copy(), _NON_FINITE, 0.0)
-    cut = _limit_slew(limited.tau, reference, bounds, dt)
-    return Limited(limited.tau_wanted, limited.tau, limited.cut | cut, limited.scale)
+    flags = _limit_slew(limited.tau, reference, bounds, dt)
+    return Limited(limited.tau_wanted, limited.tau, limited.flags | flags, limited.scale)
 
 
 @kernel

@@ -63,7 +63,7 @@ HOT = np.dtype(
             ("qdd", _REAL, _JOINT),  # [rad/s2] predicted from the torque of the last command
             ("q_previous", _REAL, _JOINT),  # [rad] of the last feedback
             ("age_previous", _REAL, _JOINT),  # [s] how old it was
-            ("watch", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.monitor_encoders`
+            ("encoder_monitors", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.monitor_encoders`
             ("rest", _INT),  # ticks all joints have been at rest
             # task
             ("has_goal", _INT),
@@ -100,14 +100,14 @@ HOT = np.dtype(
             # torque
             ("tau_obstacles", _REAL, _JOINT),  # [Nm] of the last tick
             ("sent", _REAL, (4, JOINTS_MAX)),  # [Nm] the last commands, newest first
-            ("cut", _INT),  # types.Cut of the last tick
+            ("limit_flags", _INT),  # types.LimitFlag of the last tick
             ("slew_follows_echo", _INT),  # the slew starts from the echo: the drive does not give what it is sent
             ("speed_scale", _REAL),  # fraction of qd_max that joints may have
         ],
     )
 )
 _NAMES = frozenset(HOT.names or ())
-_COLD = ("hot", "n", "verdict", "blocked_by", "model", "parameters", "placed", "table", "shapes")
+_COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes")
 _JOINTS = ("onset", "qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
 _FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "slew_follows_echo")
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
@@ -118,7 +118,7 @@ class Memory(msgspec.Struct, frozen=True):
 
     hot: F64  # what the servo level knows; see `record_of`
     n: int  # joints
-    verdict: str  # why this tick's request was refused, '' when it was not
+    refusal: str  # why this tick's request was refused, '' when it was not
     blocked_by: tuple[str, ...]  # what holds the arm, in words
     model: Model
     parameters: F64  # the model and the task space; see `flat`
@@ -135,7 +135,7 @@ class Memory(msgspec.Struct, frozen=True):
             scalar = value.item()
             return bool(scalar) if name in _FLAGS else _ENUMS[name](scalar) if name in _ENUMS else scalar
         row = value[0]
-        return row[..., : self.n] if name in _JOINTS or name in ("sent", "watch") else row
+        return row[..., : self.n] if name in _JOINTS or name in ("sent", "encoder_monitors") else row
 
     @property
     def good(self) -> I64:
@@ -277,7 +277,7 @@ def write(hot: F64, changes: Json) -> None:
             h["good"][: len(value)] = value
         elif name == "counters":
             h["counters"][:] = value
-        elif np.ndim(value) and name in (*_JOINTS, "sent", "watch"):
+        elif np.ndim(value) and name in (*_JOINTS, "sent", "encoder_monitors"):
             h[name][..., : np.shape(value)[-1]] = value
         else:
             h[name] = value

@@ -30,7 +30,7 @@ from rtctl.arm.servo_level import (
     asking,
     servo,
 )
-from rtctl.arm.session import hold_at, supervised, with_goal
+from rtctl.arm.supervision import hold_at, supervise, with_goal
 from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, pursues
 from rtctl.arm.task import between, point_of
 from rtctl.kernel.rotations import exp3, quat_of
@@ -64,10 +64,10 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     """
     f = feedback if type(feedback.link) is int else feedback._replace(link=int(feedback.link))
     bits, verb, m = REQUEST if request.verb or request.goal is not None else 0, int(request.verb), memory
-    blocked_by, verdict = memory.blocked_by, ""
+    blocked_by, refusal = memory.blocked_by, ""
     if request.obstacles:
         m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
-        verdict = m.verdict
+        refusal = m.refusal
     arm, model, parameters, placed, shapes = robot.arm, m.model, m.parameters, m.placed, m.shapes
     bodies = placed.obstacles.mesh, placed.obstacles.clouds
     hot, table, raw, flags = servo(arm, m.hot, parameters, m.table, shapes, bodies, f, asking(START, bits, verb))
@@ -76,15 +76,15 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
         bits |= WORLD if flags & MOVED else 0
         hot, table, raw, flags = servo(arm, hot, parameters, table, shapes, bodies, f, asking(MEASURED, bits, verb))
     if flags & ATTENTION:
-        m = Memory(hot, robot.n, verdict, blocked_by, model, parameters, placed, table, shapes)
+        m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes)
         m, chosen = _decided(robot, m, feedback, request)
-        hot, table, blocked_by, verdict = m.hot, m.table, m.blocked_by, m.verdict
+        hot, table, blocked_by, refusal = m.hot, m.table, m.blocked_by, m.refusal
         hot, table, raw, flags = servo(
             arm, hot, parameters, table, shapes, bodies, f, asking(DECIDED, bits | chosen, verb)
         )
     if not robot.carry:
         model = model._replace(q=record_of(hot)["q"][0, : robot.n])  # the points have not moved either
-    m = Memory(hot, robot.n, verdict, () if flags & WORDS else blocked_by, model, parameters, placed, table, shapes)
+    m = Memory(hot, robot.n, refusal, () if flags & WORDS else blocked_by, model, parameters, placed, table, shapes)
     record = np.frombuffer(raw, record_dtype(robot.n, robot.slots))
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
@@ -136,13 +136,13 @@ def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
 def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> Memory:
     """Obstacles: extrapolated to this slot, then replaced by what was seen; and why that was refused."""
     elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
-    table, verdict = obstacle_table.edited(obstacle_table.advanced(m.world, elapsed), request.obstacles)
-    return m._replace(world=table, verdict=verdict)
+    table, refusal = obstacle_table.edited(obstacle_table.advanced(m.world, elapsed), request.obstacles)
+    return m._replace(world=table, refusal=refusal)
 
 
 def _decided(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> tuple[Memory, int]:
     """Return the memory after what is rare: the supervisor's events, a new goal, the side of an escape (CHOSEN)."""
-    m = supervised(robot, m, feedback, request, m.present)
+    m = supervise(robot, m, feedback, request, m.present)
     m = with_goal(robot, m, request)
     if pursues(record_of(m.hot)[0]) and m.escape.phase == escape.Phase.CHOOSING:
         return _with_side(robot, m), CHOSEN

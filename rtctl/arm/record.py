@@ -61,7 +61,7 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
             ("tau_wanted", f, joint),
             ("tau_sent", f, joint),
             ("command", "<u4"),  # types.Drive
-            ("cut", "<u4"),  # types.Cut
+            ("cut", "<u4"),  # types.LimitFlag
             ("state", "<u4"),  # types.State
             ("status", "<u4"),  # types.Status
             ("blocker", "<i4"),  # obstacle slot (>= 0) or -1; for LIMITED and SATURATED the joint index
@@ -170,7 +170,7 @@ def pack(
         at = _put_reals(out, at, torques[r])
     at = _put_reals(out, at, o.tau_wanted)
     at = _put_record(out, at, m.sent[0, :n], reals)
-    out[at], out[at + 1], out[at + 2], out[at + 3] = o.command, m.cut, m.state, m.status
+    out[at], out[at + 1], out[at + 2], out[at + 3] = o.command, m.limit_flags, m.state, m.status
     out[at + 4] = m.blocker & _WORD
     longs[0] = m.blockers
     at = _put(out, at + 5, long)

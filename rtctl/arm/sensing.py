@@ -29,14 +29,14 @@ from rtctl.arm.target import target_of
 from rtctl.control.faults import latch_with
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, largest
-from rtctl.types import B1, F64, Cut, Feedback, RecordRow, State
+from rtctl.types import B1, F64, Feedback, LimitFlag, RecordRow, State
 from rtctl.world.primitives import Obstacles
 
 REST_SPEED = 0.03  # [rad/s] a joint slower than this rests (encoders of MIT drives resolve 0.005)
 
 # numbers of the enumerations, as compiled code reads them
 _ARMED, _RUN, _STOPPING, _SAFE_STOP = (int(s) for s in (State.ARMED, State.RUN, State.STOPPING, State.SAFE_STOP))
-_NON_FINITE, _FAULTS = int(Cut.NON_FINITE), len(FAULTS)
+_NON_FINITE, _FAULTS = int(LimitFlag.NON_FINITE), len(FAULTS)
 
 
 class Surroundings(NamedTuple):
@@ -163,7 +163,7 @@ def _monitored(c: RecordRow, m: RecordRow, f: Feedback, A: F64) -> tuple[F64, in
     """Return the monitors of the encoders after this tick, and their flags."""
     n = f.q.shape[0]
     return encoder_flags(
-        m.watch[:, :n].copy(),
+        m.encoder_monitors[:, :n].copy(),
         f,
         PreviousPositions(m.q_previous[:n].copy(), m.age_previous[:n].copy(), c.dt * (1 + f.missed)),
         ExpectedMotion(m.qdd[:n].copy(), A),
@@ -201,7 +201,7 @@ def detect_faults(c: RecordRow, m: RecordRow, f: Feedback, A: F64, around: Surro
         implausible,
         m.slew_follows_echo != 0,
         m.recovering != 0,
-        m.cut & _NON_FINITE != 0 or not math.isfinite(m.innovation),
+        m.limit_flags & _NON_FINITE != 0 or not math.isfinite(m.innovation),
         m.has_goal != 0,
         m.innovation,
     )
@@ -214,7 +214,7 @@ def detect_faults(c: RecordRow, m: RecordRow, f: Feedback, A: F64, around: Surro
     for i in range(8):
         k[i] = counters[i]
     m.in_force, m.good[:_FAULTS] = latch_with(m.present, m.in_force, m.good[:_FAULTS].copy(), AUTOMATIC)
-    m.q_previous[:n], m.age_previous[:n], m.watch[:, :n] = f.q, f.age, monitors
+    m.q_previous[:n], m.age_previous[:n], m.encoder_monitors[:, :n] = f.q, f.age, monitors
     m.outside = 1 if flags & BEYOND else 0
     m.recovering = m.recovering & m.outside
     m.rest = 0 if flags & STIRS else m.rest + 1

@@ -179,7 +179,7 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
     m.qdd[:n] = 0.0
     if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
         m.qdd[:n] = acceleration(model.A_inv, tau, model.h, model.g, c.viscous[:n].copy(), qd)
-    m.cut, m.slew_follows_echo = limited.cut | m.cut, 1 if follows else 0
+    m.limit_flags, m.slew_follows_echo = limited.flags | m.limit_flags, 1 if follows else 0
     return command, limited.tau_wanted
 
 
@@ -213,7 +213,7 @@ def _act(
         )
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
-    _, m.cut = law(
+    _, m.limit_flags = law(
         arm.constants,
         Cover(arm.radius, arm.link),
         field,

@@ -244,14 +244,14 @@ def _tail(arguments: argparse.Namespace) -> int:
     until = time.monotonic() + arguments.seconds
     shown = -1e9
     while True:
-        news = followed.news()
-        for event in news.events:
+        new = followed.read_on()
+        for event in new.events:
             _say(event, arguments.json)
-        if len(news.ticks) and float(news.ticks["time"][-1]) - shown >= arguments.every:
-            shown = float(news.ticks["time"][-1])
-            print(json.dumps(_state(news.ticks[-1])) if arguments.json else _line(news.ticks[-1]), flush=True)
-        if news.ended:
-            print(json.dumps({"ended": news.ended}) if arguments.json else f"ended: {news.ended.get('reason', '?')}")
+        if len(new.ticks) and float(new.ticks["time"][-1]) - shown >= arguments.every:
+            shown = float(new.ticks["time"][-1])
+            print(json.dumps(_state(new.ticks[-1])) if arguments.json else _line(new.ticks[-1]), flush=True)
+        if new.ended:
+            print(json.dumps({"ended": new.ended}) if arguments.json else f"ended: {new.ended.get('reason', '?')}")
             return EXIT_OK
         if time.monotonic() > until:
             return EXIT_OK

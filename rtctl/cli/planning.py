@@ -10,7 +10,7 @@ import numpy as np
 
 from rtctl import design as cfg
 from rtctl.app.plan import plan
-from rtctl.app.stream import Follower, Seen
+from rtctl.app.stream import ArmStatus, GoalStream
 from rtctl.arm.robot import Robot
 from rtctl.arm.task import turns
 from rtctl.cli.goals import send
@@ -101,38 +101,38 @@ def _with_daemon(arguments: argparse.Namespace, robot: Robot, goal: Goal) -> int
             return EXIT_OK
         if status["state"] != "RUN":
             raise RequestError(f"plan --run: not possible in state {status['state']}: arm first")
-        follower = Follower(planned, q, arguments.seed)
-        return _follow(session, follower, arguments)
+        stream = GoalStream(planned, q, arguments.seed)
+        return _follow(session, stream, arguments)
 
 
-def _follow(session: Session, follower: Follower, arguments: argparse.Namespace) -> int:
+def _follow(session: Session, stream: GoalStream, arguments: argparse.Namespace) -> int:
     begun, elapsed, status = time.monotonic(), 0.0, Json()
-    while not follower.over:
+    while not stream.over:
         status = accepted(session.ask({"verb": "status"}))
         elapsed = time.monotonic() - begun
         if status["state"] != "RUN":
-            follower.over = str(status["state"])
+            stream.over = str(status["state"])
         elif elapsed > arguments.timeout:
-            follower.over = f"{status['status']} {status['detail']} after {arguments.timeout:g} s"
+            stream.over = f"{status['status']} {status['detail']} after {arguments.timeout:g} s"
         else:
-            _step(session, follower, status)
+            _step(session, stream, status)
             time.sleep(POLL)
-    arrived = follower.over == "arrived"
+    arrived = stream.over == "arrived"
     if arguments.json:
-        outcome = {"arrived": arrived, "why": follower.over, "time_s": elapsed, "replans": follower.replans}
+        outcome = {"arrived": arrived, "why": stream.over, "time_s": elapsed, "replans": stream.replans}
         print(json.dumps({**outcome, "error_m": status["error_m"]}))
     else:
-        print(f"{'arrived' if arrived else 'NOT REACHED: ' + follower.over}  {elapsed:.2f} s")
+        print(f"{'arrived' if arrived else 'NOT REACHED: ' + stream.over}  {elapsed:.2f} s")
     return EXIT_OK if arrived else EXIT_FAILED
 
 
-def _step(session: Session, follower: Follower, status: Json) -> None:
+def _step(session: Session, stream: GoalStream, status: Json) -> None:
     """Give the sub-goal that is due, and tell of new plans."""
-    seen = Seen(status["status"], status["detail"], np.array(status["x_m"]), np.array(status["q_rad"]))
-    goal = follower.next(seen)
-    for text in follower.news:
+    seen = ArmStatus(status["status"], status["detail"], np.array(status["x_m"]), np.array(status["q_rad"]))
+    goal = stream.next(seen)
+    for text in stream.events:
         print(f"plan: {text}", file=sys.stderr, flush=True)
-    follower.news.clear()
+    stream.events.clear()
     if goal is not None:
         send(session, {"verb": "goal", **message_of(goal)})
 

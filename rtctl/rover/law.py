@@ -28,11 +28,11 @@ CREEP = 0.3  # [m/s] at which a car that cannot turn on the spot comes round
 class Push(NamedTuple):
     """The field on the base."""
 
-    seen: F64  # (2,) [m/s2] of the returns of the scan and of the chart, one union
-    told: F64  # (K, 2) [m/s2] of each told obstacle
-    rho_seen: float  # [m] to the nearest return of the newest scan, infinite without one
-    rho: F64  # (K,) [m] to each told obstacle, infinite where there is none
-    closing: F64  # (K,) [m/s] of each told obstacle towards the base by its own motion
+    sensed: F64  # (2,) [m/s2] of the returns of the scan and of the chart, one union
+    known: F64  # (K, 2) [m/s2] of each known obstacle
+    rho_sensed: float  # [m] to the nearest return of the newest scan, infinite without one
+    rho: F64  # (K,) [m] to each known obstacle, infinite where there is none
+    closing: F64  # (K,) [m/s] of each known obstacle towards the base by its own motion
     normal: F64  # (K, 2)
 
 
@@ -206,13 +206,13 @@ def allowed_speed(
     """Return the speed [m/s] that can be braked to rest before anything ahead; at most V_max.
 
     direction (2,): unit. coming [m]: the way that what was sent will still take. Straight on, a circle of the hull's
-    radius must not come nearer than `stop` to a return or a told obstacle; one that moves is met with its own speed
+    radius must not come nearer than `stop` to a return or a known obstacle; one that moves is met with its own speed
     taken off what may be spent.
     """
     m = base.margins
     r = m.hull + m.stop
-    gap = _gap_seen(x, direction, r, seen)
-    gap = min(gap, _gap_told(x, direction, r, m.height, obstacles, HORIZON))
+    gap = _gap_sensed(x, direction, r, seen)
+    gap = min(gap, _gap_known(x, direction, r, m.height, obstacles, HORIZON))
     coming = max(coming, 0.0)
     v = min(base.limits.v_max, spend(gap - coming, m.brake, RESERVE * m.lag))
     for k in np.flatnonzero(push.closing > 0.0):
@@ -253,7 +253,7 @@ def spend(gap: float, brake: float, lag: float) -> float:
 
 
 @kernel
-def _gap_seen(x: F64, e: F64, r: float, seen: F64) -> float:
+def _gap_sensed(x: F64, e: F64, r: float, seen: F64) -> float:
     """Return how far [m] a circle of radius r about x can move along e until a return touches it."""
     gap = math.inf
     for i in range(seen.shape[0]):
@@ -266,8 +266,8 @@ def _gap_seen(x: F64, e: F64, r: float, seen: F64) -> float:
 
 
 @kernel
-def _gap_told(x: F64, e: F64, r: float, height: float, obstacles: Obstacles, horizon: float) -> float:
-    """Return the same for told obstacles: steps as long as the free distance never jump over one."""
+def _gap_known(x: F64, e: F64, r: float, height: float, obstacles: Obstacles, horizon: float) -> float:
+    """Return the same for known obstacles: steps as long as the free distance never jump over one."""
     slots = obstacles.active.shape[0]
     P, none, out = np.empty((3, 1)), np.zeros(1), np.zeros((slots, 4, 1))
     s = 0.0

@@ -36,7 +36,7 @@ class BaseMemory(NamedTuple):
     since: int  # tick of entering the state
     reaction: Severity
     off: bool  # SAFE_STOP does not stream any more
-    held: bool  # SAFE_STOP asked for the autopilot's hold mode
+    hold_asked: bool  # SAFE_STOP asked for the autopilot's hold mode
     in_force: int
     good: I64  # (faults,)
     counters: Counters
@@ -44,7 +44,7 @@ class BaseMemory(NamedTuple):
     mine: bool  # we armed the vehicle and nobody took it since
     leaving: bool
     done: bool
-    verdict: str
+    refusal: str
     # estimate
     here: Estimate
     innovation: float  # [m] of the last report
@@ -68,7 +68,7 @@ class BaseMemory(NamedTuple):
     scans: tuple[F64, ...]  # (m, 2) [m] returns of the last scan of each sensor, in the world
     way: Way
     due: int  # tick at which the way is looked for anew
-    rho: F64  # (K,) [m] to each told obstacle
+    rho: F64  # (K,) [m] to each known obstacle
     rho_seen: float  # [m] to the nearest return
     # command
     v_ref: F64  # (2,) [m/s]
@@ -79,5 +79,5 @@ class BaseMemory(NamedTuple):
     unfixed: float  # [s] without a GPS that there was
     asked: F64  # (2,) [m/s, rad/s] twist that was asked for, as late as it takes effect, smoothed
     did: F64  # (2,) the twist that came of it, smoothed alike
-    idle: F64  # (2,) [s] for which little of it came
+    unanswered: F64  # (2,) [s] for which little of it came
     sent: F64  # (h, 2) the last twists [m/s, rad/s], newest first: what is still on its way to the wheels

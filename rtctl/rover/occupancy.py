@@ -68,7 +68,7 @@ def shifted(chart: Chart, by: F64) -> Chart:
     return chart._replace(origin=chart.origin + np.round(by / CELL).astype(np.int64))
 
 
-class Look(NamedTuple):
+class PlacedScan(NamedTuple):
     """One turn of a range sensor."""
 
     x: F64  # (2,) [m] of the sensor
@@ -78,17 +78,17 @@ class Look(NamedTuple):
     reach: float  # [m]
 
 
-def looked(chart: Chart, look: Look, tick: int) -> Chart:
+def integrate_scan(chart: Chart, scan: PlacedScan, tick: int) -> Chart:
     """Return the chart after one scan, taken in this tick."""
     cells, seen = chart.cells.copy(), chart.seen.copy()
-    _look(cells, seen, chart.origin, look, tick)
+    _integrate(cells, seen, chart.origin, scan, tick)
     return chart._replace(cells=cells, seen=seen)
 
 
 @kernel
-def _look(cells: U8Grid, seen: I32Grid, origin: I64, look: Look, tick: int) -> None:
-    x, step, scan, reach = look.x, look.step, look.ranges, look.reach
-    count, turn = scan.shape[0], 2.0 * math.pi
+def _integrate(cells: U8Grid, seen: I32Grid, origin: I64, scan: PlacedScan, tick: int) -> None:
+    x, step, ranges, reach = scan.x, scan.step, scan.ranges, scan.reach
+    count, turn = ranges.shape[0], 2.0 * math.pi
     around = round(turn / abs(step))
     half = int(reach / CELL) + 1
     ci, cj = math.floor(x[0] / CELL) - origin[0], math.floor(x[1] / CELL) - origin[1]
@@ -98,7 +98,7 @@ def _look(cells: U8Grid, seen: I32Grid, origin: I64, look: Look, tick: int) -> N
             d = math.sqrt(dx * dx + dy * dy)
             if d > reach - CELL or d < CELL:
                 continue
-            angle = math.atan2(dy, dx) - look.angle
+            angle = math.atan2(dy, dx) - scan.angle
             wide = 0.7 * CELL / d  # every beam that touches the cell must have passed it
             first = math.floor((angle - wide) / step + 0.5)
             last = math.floor((angle + wide) / step + 0.5)
@@ -107,17 +107,17 @@ def _look(cells: U8Grid, seen: I32Grid, origin: I64, look: Look, tick: int) -> N
             passed = True
             for k in range(first, last + 1):
                 at = k % around
-                if at >= count or scan[at] < d + 0.7 * CELL:
+                if at >= count or ranges[at] < d + 0.7 * CELL:
                     passed = False
             if passed:
                 seen[i, j] = tick
                 if cells[i, j] > 0:
                     cells[i, j] -= 1
     for k in range(count):
-        d = scan[k]
+        d = ranges[k]
         if d < 0.0 or d > reach:
             continue
-        angle = look.angle + k * step
+        angle = scan.angle + k * step
         i = math.floor((x[0] + d * math.cos(angle)) / CELL) - origin[0]
         j = math.floor((x[1] + d * math.sin(angle)) / CELL) - origin[1]
         if 0 <= i < SIZE and 0 <= j < SIZE:
@@ -212,9 +212,9 @@ def _unseen(
 
 
 def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
-    """Return the distance (SIZE, SIZE) [m] of each cell's centre to the nearest return or told obstacle.
+    """Return the distance (SIZE, SIZE) [m] of each cell's centre to the nearest return or known obstacle.
 
-    Beyond STENCIL cells it is that many: nobody asks how much further. height [m] is where the told obstacles, which
+    Beyond STENCIL cells it is that many: nobody asks how much further. height [m] is where the known obstacles, which
     are solids, are cut.
     """
     field = np.empty((SIZE, SIZE))

@@ -13,8 +13,8 @@ from rtctl.rover.faults import BIT, FAULTS, Counters, severity
 from rtctl.rover.memory import NO_LOOK, BaseMemory
 from rtctl.rover.record import make_base_record
 from rtctl.rover.robot import SECTORS, Base, Wheels
-from rtctl.rover.session import detected, driving, goal_distance, supervised, with_goal
 from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word, at_rest
+from rtctl.rover.supervision import detected, driving, goal_distance, supervise, with_goal
 from rtctl.types import F64, Goal, ObstacleEdit, Record, Request, Severity, Shape, State, Status, Task
 from rtctl.world import obstacle_table
 
@@ -37,13 +37,13 @@ def tick(
     base: Base, memory: BaseMemory, feedback: BaseFeedback, request: Request
 ) -> tuple[BaseMemory, BaseCommand, Record]:
     """Return (memory, command, record) of one servo period."""
-    m = memory._replace(tick=memory.tick + 1, verdict="")
+    m = memory._replace(tick=memory.tick + 1, refusal="")
     elapsed = base.dt * (1 + min(feedback.missed, MISSED_MAX))
     m = _estimated(base, m, feedback, elapsed)
     m = _compared(base, m, elapsed)
     m = _perceived(base, m, feedback, request, elapsed)
     m, present = detected(base, m, feedback)
-    m = supervised(base, m, feedback, request, present)
+    m = supervise(base, m, feedback, request, present)
     m = with_goal(base, m, request)
     m = _guided(base, m)
     m, judged = _law(base, m, feedback, elapsed)
@@ -64,7 +64,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         since=-1,
         reaction=Severity.NONE,
         off=False,
-        held=False,
+        hold_asked=False,
         in_force=0,
         good=np.full(len(FAULTS), 1 << 30),
         counters=Counters(),
@@ -72,7 +72,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         mine=False,
         leaving=False,
         done=False,
-        verdict="",
+        refusal="",
         here=estimator.start(feedback.position, feedback.yaw, base.noise),
         innovation=0.0,
         unheard=0.0,
@@ -96,7 +96,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         unfixed=0.0,
         asked=np.zeros(2),
         did=np.zeros(2),
-        idle=np.zeros(2),
+        unanswered=np.zeros(2),
         way=path.NO_WAY,
         due=0,
         rho=far,
@@ -147,36 +147,36 @@ def _estimated(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> Ba
 
 def _perceived(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, elapsed: float) -> BaseMemory:
     """Told obstacles moved on and edited, a new scan drawn into the chart from where it was taken."""
-    table, verdict = obstacle_table.advanced(m.world, elapsed), m.verdict
+    table, refusal = obstacle_table.advanced(m.world, elapsed), m.refusal
     if request.obstacles:
-        table, verdict = obstacle_table.edited(table, request.obstacles)
+        table, refusal = obstacle_table.edited(table, request.obstacles)
     seen, scans, due = occupancy.moved(m.chart, m.here.x), m.scans, m.due
     if f.scans and f.scan_age < base.safety.scan_stale:
-        look = _look(base, m, f)
-        seen = occupancy.looked(seen, look, m.tick - round(f.scan_age / base.dt))
+        scan = _placed_scan(base, m, f)
+        seen = occupancy.integrate_scan(seen, scan, m.tick - round(f.scan_age / base.dt))
         k = min(f.sensor, len(scans) - 1)
-        scans, due = (*scans[:k], _returns(look), *scans[k + 1 :]), min(due, m.tick)
+        scans, due = (*scans[:k], _returns(scan), *scans[k + 1 :]), min(due, m.tick)
     if m.tick % BEAM_TICKS == 0 and (f.beams >= 0.0).any():
-        look = occupancy.Look(m.here.x, m.here.yaw, -0.25 * math.pi, f.beams, min(f.beam_reach, base.sense))
-        seen = occupancy.looked(seen, look, m.tick)
+        scan = occupancy.PlacedScan(m.here.x, m.here.yaw, -0.25 * math.pi, f.beams, min(f.beam_reach, base.sense))
+        seen = occupancy.integrate_scan(seen, scan, m.tick)
     seen = occupancy.stood(seen, m.here.x, base.margins.hull, m.tick)
     rho = m.goal_rho if m.goal is None else goal_distance(base, table, m.goal)
-    return m._replace(world=table, verdict=verdict, chart=seen, scans=scans, due=due, goal_rho=rho)
+    return m._replace(world=table, refusal=refusal, chart=seen, scans=scans, due=due, goal_rho=rho)
 
 
-def _look(base: Base, m: BaseMemory, f: BaseFeedback) -> occupancy.Look:
+def _placed_scan(base: Base, m: BaseMemory, f: BaseFeedback) -> occupancy.PlacedScan:
     """Return the feedback's scan from where its sensor was when it was taken."""
     x, yaw = m.here.x - f.scan_age * m.here.v, m.here.yaw - f.scan_age * m.here.yaw_rate
     c, s = math.cos(yaw), math.sin(yaw)
     at = x + np.array([c * f.scan_offset[0] - s * f.scan_offset[1], s * f.scan_offset[0] + c * f.scan_offset[1]])
-    return occupancy.Look(at, yaw + f.scan_start, f.scan_step, f.scan, min(f.scan_reach, base.sense))
+    return occupancy.PlacedScan(at, yaw + f.scan_start, f.scan_step, f.scan, min(f.scan_reach, base.sense))
 
 
-def _returns(look: occupancy.Look) -> F64:
+def _returns(scan: occupancy.PlacedScan) -> F64:
     """Return the points (m, 2) [m] that a scan touched."""
-    hit = (look.ranges >= 0.0) & (look.ranges <= look.reach)
-    angle = look.angle + look.step * np.flatnonzero(hit)
-    points: F64 = look.x + look.ranges[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    hit = (scan.ranges >= 0.0) & (scan.ranges <= scan.reach)
+    angle = scan.angle + scan.step * np.flatnonzero(hit)
+    points: F64 = scan.x + scan.ranges[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return points
 
 
@@ -206,7 +206,7 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
         m = m._replace(way=kept, due=m.due if len(kept.corners) else m.tick + 1)
     whole = m.way.length + m.way.short
     gained = whole < m.nearest - PROGRESS
-    m = turn.looked(base, m)
+    m = turn.look_around(base, m)
     heading = turn.wanted(base, m)
     heading = m.look.heading if math.isnan(heading) else heading
     still = 0 if gained or not math.isnan(heading) else m.still + 1
@@ -247,7 +247,7 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
     dark = by_sight < min(BLIND_SPEED, allowed)
     keeps = m.blind if dark and m.status == Status.BLIND else 0  # a stop to look is no end of it
     blind = m.blind + 1 if dark and speed > 0.05 else keeps
-    m = m._replace(rho=push.rho, rho_seen=push.rho_seen, allowed_seen=by_sight, blind=blind)
+    m = m._replace(rho=push.rho, rho_seen=push.rho_sensed, allowed_seen=by_sight, blind=blind)
     return m, (v_ref, push, xd_d, min(allowed, by_sight))
 
 
@@ -256,8 +256,8 @@ def _pushed(base: Base, push: law.Push, rests: bool) -> F64:
 
     A base that rests at its goal stays there: it gives way to what comes, or is nearer than rho_min, alone.
     """
-    told = np.where(((push.closing > 0.0) | (push.rho < base.field.rho_min))[:, None] | (not rests), push.told, 0.0)
-    seen = push.seen if not rests or push.rho_seen < base.field.rho_min else np.zeros(2)
+    told = np.where(((push.closing > 0.0) | (push.rho < base.field.rho_min))[:, None] | (not rests), push.known, 0.0)
+    seen = push.sensed if not rests or push.rho_sensed < base.field.rho_min else np.zeros(2)
     total: F64 = seen + told.sum(axis=0)
     return total
 
@@ -273,7 +273,7 @@ def _compared(base: Base, m: BaseMemory, elapsed: float) -> BaseMemory:
     Where less than LITTLE of what was asked for comes, time runs; `no_effect` is what it leads to.
     """
     if not driving(m):
-        return m._replace(asked=np.zeros(2), did=np.zeros(2), idle=np.zeros(2))
+        return m._replace(asked=np.zeros(2), did=np.zeros(2), unanswered=np.zeros(2))
     h = len(m.sent)
     late = (min(round(base.margins.lag / base.dt), h) - 1, min(round(base.margins.turn_lag / base.dt), h) - 1)
     due = np.array([m.sent[late[0], 0], m.sent[late[1], 1]])
@@ -283,7 +283,7 @@ def _compared(base: Base, m: BaseMemory, elapsed: float) -> BaseMemory:
     little = (np.abs(asked) > ASKED) & (did * np.sign(asked) < LITTLE * np.abs(asked))
     if base.world_velocity:
         little[1] = False  # its autopilot turns as it thinks best
-    return m._replace(asked=asked, did=did, idle=np.where(little, m.idle + elapsed, 0.0))
+    return m._replace(asked=asked, did=did, unanswered=np.where(little, m.unanswered + elapsed, 0.0))
 
 
 def _ahead(base: Base, m: BaseMemory) -> tuple[F64, float]:
@@ -328,7 +328,7 @@ def _asked(base: Base, m: BaseMemory, f: BaseFeedback) -> Ask:
         return Ask.DISARM if m.mine and f.armed and resting else Ask.SILENCE
     if not f.ours or (m.state == State.SAFE_STOP and m.off):
         return Ask.SILENCE
-    if m.state == State.SAFE_STOP and m.held:
+    if m.state == State.SAFE_STOP and m.hold_asked:
         return Ask.HOLD
     return Ask.DRIVE
 
@@ -421,9 +421,9 @@ def _record(
         way_length=m.way.length,
         way_short=m.way.short,
         rho=push.rho,
-        push_told=push.told,
-        rho_seen=push.rho_seen,
-        push_seen=push.seen,
+        push_told=push.known,
+        rho_seen=push.rho_sensed,
+        push_seen=push.sensed,
         xd_d=xd_d,
         v_ref=v_ref,
         allowed=allowed,

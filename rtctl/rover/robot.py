@@ -38,7 +38,7 @@ class Margins(NamedTuple):
     brake: float  # [m/s2] it relies on
     lag: float  # [s] from a set-point to the speed it asks for; the state is predicted by it
     turn_lag: float  # [s] the same of the yaw rate
-    height: float  # [m] where told obstacles, which are solids, are cut
+    height: float  # [m] where known obstacles, which are solids, are cut
 
 
 class SafetyParams(NamedTuple):

@@ -80,7 +80,7 @@ def rate(base: Base, m: BaseMemory, yaw: float) -> float:
     return math.copysign(fast, angle)
 
 
-def looked(base: Base, m: BaseMemory) -> BaseMemory:
+def look_around(base: Base, m: BaseMemory) -> BaseMemory:
     """Return the memory with the look that is being made: begun, gone on with, or ended."""
     if m.goal is None or not len(m.way.corners) or base.limits.radius > 0.0 or base.world_velocity:
         return m._replace(look=NO_LOOK)

@@ -39,7 +39,7 @@ ARM, MODE = 400, 176
 VELOCITY_YAW_RATE = 0x05C7  # of SET_POSITION_TARGET_LOCAL_NED: velocity and yaw rate count
 VELOCITY = 0x0DC7  # velocity alone
 LOCAL_NED, BODY_NED = 1, 8
-NEWS = 200  # lines kept
+EVENTS_MAX = 200  # lines kept
 BACKLOG = 100_000  # frames of the handshake that are kept for the log
 SETTLE, FRESH = 2.0, 0.1  # [s] for the state of now after the handshake; what counts as that
 PROGRESS = 5.0  # [s] between two lines on what is waited for
@@ -105,8 +105,8 @@ class MavLink:
     def __init__(self, spec: MavSpec, wire: Wire, keys: Keys) -> None:
         self.spec, self.wire, self.keys = spec, wire, keys
         self.stack = STACKS[spec.autopilot]
-        self.news: deque[str] = deque(maxlen=NEWS)  # what people should read: refusals, texts of the vehicle
-        self.view = View(self.news.append, spec.sensors, spec.autopilot)
+        self.events: deque[str] = deque(maxlen=EVENTS_MAX)  # what people should read: refusals, texts of the vehicle
+        self.view = View(self.events.append, spec.sensors, spec.autopilot)
         self.talk = Talk()
         self.received: list[bytes] = []  # frames of this cycle as they came
         self.vehicle: tuple[int, int] | None = None  # pinned (system, component)
@@ -264,7 +264,7 @@ class MavLink:
     def _pass_over(self, source: tuple[int, int], what: str) -> None:
         if source not in self._strangers:
             self._strangers.add(source)
-            self.news.append(f"{source} is {what}: passed over, an {self.spec.autopilot} rover is waited for")
+            self.events.append(f"{source} is {what}: passed over, an {self.spec.autopilot} rover is waited for")
 
     def _sequence(self, sequence: int) -> None:
         """Count messages that did not come within a window of later ones; one that is late is no loss."""
@@ -360,7 +360,7 @@ class MavLink:
             word = answers.get(name, Word.PENDING)
             if word not in (Word.PENDING, Word.ACCEPTED):
                 if self._word == Word.PENDING:
-                    self.news.append(
+                    self.events.append(
                         f"{'arming' if name == 'arm' else 'our mode'}: {word.name.lower().replace('_', ' ')}"
                     )
                 self._word = word
@@ -452,7 +452,7 @@ class MavLink:
         self.view.uplink_at = math.nan  # nothing was asked meanwhile
 
     def _last_words(self) -> str:
-        return f" ({self.news[-1]})" if self.news else ""
+        return f" ({self.events[-1]})" if self.events else ""
 
     def _ask_parameter(self, name: str) -> None:
         assert self.vehicle is not None
@@ -494,13 +494,13 @@ class MavLink:
     def _report(self) -> None:
         """Tell what was granted, and which settings of the vehicle may fight or fail to stop us."""
         rates = ", ".join(f"{name} {rate:g} Hz" for name, rate in self.talk.rates.items())
-        self.news.append(f"vehicle {self.vehicle}, {rates or 'no stream was granted'}")
+        self.events.append(f"vehicle {self.vehicle}, {rates or 'no stream was granted'}")
         p = self.view.parameters
-        self.news.append("parameters: " + (", ".join(f"{k} = {v:g}" for k, v in p.items()) or "none was answered"))
+        self.events.append("parameters: " + (", ".join(f"{k} = {v:g}" for k, v in p.items()) or "none was answered"))
         if p.get("AVOID_ENABLE", 0.0) or p.get("OA_TYPE", 0.0):
-            self.news.append("the autopilot's own avoidance is on: it acts on our velocities and can fight ours")
+            self.events.append("the autopilot's own avoidance is on: it acts on our velocities and can fight ours")
         if p.get("FS_GCS_ENABLE", 1.0) == 0.0:
-            self.news.append("FS_GCS_ENABLE = 0: the autopilot does not stop by itself when this program is gone")
+            self.events.append("FS_GCS_ENABLE = 0: the autopilot does not stop by itself when this program is gone")
 
     def local(self, latitude: float, longitude: float) -> tuple[float, float] | None:
         """Return (east, north) [m] of a place [deg]; None while the vehicle's origin is not known."""

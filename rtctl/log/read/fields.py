@@ -57,7 +57,7 @@ FIELDS: dict[str, Field] = {
     "tau_wanted": Field("Nm", "sum of the parts"),
     "tau_sent": Field("Nm", "torque that was sent, after the limits"),
     "command": Field("", "what was asked of the drives, types.Drive"),
-    "cut": Field("", "protections that altered the torque, types.Cut"),
+    "cut": Field("", "protections that altered the torque, types.LimitFlag"),
     "state": Field("", "supervisor's state, types.State"),
     "status": Field("", "what holds the arm from its goal, types.Status"),
     "blocker": Field("", "obstacle slot or joint that holds it, -1 none"),

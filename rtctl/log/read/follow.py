@@ -21,7 +21,7 @@ from rtctl.plain import Json
 MOST = 2 * limits.CHUNK  # [bytes] read at a look
 
 
-class News(NamedTuple):
+class NewRecords(NamedTuple):
     """What a look at the file brought."""
 
     ticks: NDArray[np.void]  # the records that are new; empty for another program's log
@@ -45,7 +45,7 @@ class Tail:
         done = self.path.with_name(self.path.name.removesuffix(OPEN))
         return self.path if self.path.exists() else done
 
-    def news(self) -> News:
+    def read_on(self) -> NewRecords:
         """Return what has been written since the last call. Raises LogError when the file has gone."""
         try:
             with self._file.open("rb") as file:
@@ -80,7 +80,7 @@ class Tail:
             raise LogError(f"{self.path}: a record of more than {MOST >> 20} MiB at {self._at}")
         self._at += used
         ticks = np.concatenate(found) if found else np.zeros(0, self.header.dtype)
-        return News(ticks, [e for e in events if isinstance(e, dict)], ended)
+        return NewRecords(ticks, [e for e in events if isinstance(e, dict)], ended)
 
     def _topics(self, content: bytes) -> list[tuple[int, Topic]]:
         rows = chunk_messages(content)

@@ -17,7 +17,7 @@ from rtctl.log.view.report.bins import Bins, Histogram, Spectrum
 from rtctl.log.view.report.slots import Slots, Way
 from rtctl.plain import Json
 from rtctl.spec.bus import frame_time
-from rtctl.types import F64, Array, Cut, State, Status
+from rtctl.types import F64, Array, LimitFlag, State, Status
 
 XYZ = ("x", "y", "z")
 PARTS = ("motion", "obstacles", "limits", "posture", "gravity")
@@ -107,7 +107,7 @@ def gather(run: Run, progress: Callable[[int], None] = lambda n: None) -> Gather
     states = _Turns(lambda v: called(State, v))
     statuses = _Turns(lambda v: called(Status, v).lower())
     faults = _Bits({1 << i: name for i, name in enumerate(fault_table(header))})
-    cuts = _Bits({int(cut): cut.name.lower() for cut in Cut if cut and cut.name})
+    cuts = _Bits({int(cut): cut.name.lower() for cut in LimitFlag if cut and cut.name})
     figures = _Figures()
     done, marks = 0, list[tuple[int, float]]()
     for piece in run.pieces(schema.TICK):

@@ -22,7 +22,7 @@ INSIDE = "no joint is beyond its limits, there is nothing to recover from: use a
 RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {})
 
 
-def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:
+def supervise(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:
     """Return the memory after the supervisor's table took this tick's events."""
     if m.state == State.RUN and request.verb == Verb.NONE and faults.TABLE.stops(m.in_force) < Severity.SS2:
         return m  # what RUN is left for is asked, or a fault
@@ -43,7 +43,7 @@ def supervised(robot: Robot, m: Memory, feedback: Feedback, request: Request, pr
         refusal,
     )
     step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
-    m = m._replace(**step.session._asdict(), verdict=step.refusal or m.verdict)
+    m = m._replace(**step.session._asdict(), refusal=step.refusal or m.refusal)
     if clearing:
         m = m._replace(clear_until=m.tick + round(CLEAR_TIME / robot.dt))
     if m.state != before:
@@ -90,20 +90,20 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
     goal = request.goal
     if goal is None:
         return m
-    verdict = ""
+    refusal = ""
     if m.state != State.RUN:
-        verdict = f"goal: not possible in state {m.state.name}"
+        refusal = f"goal: not possible in state {m.state.name}"
     elif m.outside:
-        verdict = "goal: a joint is still beyond its limits"
+        refusal = "goal: a joint is still beyond its limits"
     if goal.posture is not None and not _is_posture(robot, goal.posture):
-        verdict = verdict or f"goal: got posture {goal.posture}, wanted {robot.n} angles within the joint limits"
+        refusal = refusal or f"goal: got posture {goal.posture}, wanted {robot.n} angles within the joint limits"
     wanted, why = task.within(goal.task, robot.axes)
     goal = goal._replace(task=wanted)
     rho = obstacle_table.distance_from(m.world, task.point_of(goal, m.tip.x))
     near = goal._replace(position=task.point_of(goal, robot.base))  # what is free is no further than it need be
-    verdict = verdict or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
-    if verdict:
-        return m._replace(verdict=verdict)
+    refusal = refusal or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
+    if refusal:
+        return m._replace(refusal=refusal)
     return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING)
 
 

@@ -36,7 +36,7 @@ def driving(m: BaseMemory) -> bool:
 def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, int]:
     """Return the memory with the faults in force, and the bits of those present now."""
     active = driving(m)
-    watched = active and not m.held
+    watched = active and not m.hold_asked
     taken = watched and m.entered and not f.ours
     taken = taken or (m.state == State.ARMED and m.entered and not f.ours)
     failed = m.state == State.ARMED and (f.word in REFUSALS or (m.tick - m.since) * base.dt >= base.engage)
@@ -51,7 +51,7 @@ def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, in
         goal_inside=m.goal is not None and reductions.any_below(m.goal_rho, 0.0),
         feed_age=obstacle_table.oldest(m.world),
         reboots=m.last.reboots,
-        no_effect=bool((m.idle > NO_EFFECT * (3.0 if base.world_velocity else 1.0)).any()),
+        no_effect=bool((m.unanswered > NO_EFFECT * (3.0 if base.world_velocity else 1.0)).any()),
         unfixed=m.unfixed,
     )
     present, counters = faults.detect(f, evidence, m.counters, base.safety)
@@ -61,12 +61,12 @@ def detected(base: Base, m: BaseMemory, f: BaseFeedback) -> tuple[BaseMemory, in
     return m._replace(counters=counters, in_force=in_force, good=good), present
 
 
-def supervised(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, present: int) -> BaseMemory:
+def supervise(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, present: int) -> BaseMemory:
     """Return the memory after the supervisor's table took this tick's events."""
     before = m.state
     asked = Asked(m.tick, request.verb, present, _timed(base, m, f, present))
     step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
-    m = m._replace(**step.session._asdict(), verdict=step.refusal or m.verdict)
+    m = m._replace(**step.session._asdict(), refusal=step.refusal or m.refusal)
     if m.state != before:
         m = _entered(m)
     return _followed(base, m, f, present)
@@ -82,11 +82,11 @@ def _followed(base: Base, m: BaseMemory, f: BaseFeedback, present: int) -> BaseM
     if m.state == State.SAFE_STOP and not m.off:
         elapsed = (m.tick - m.since) * base.dt
         over = m.rest * base.dt >= REST_HOLD or elapsed >= STOP_TIME
-        held = m.held or (m.reaction >= Severity.SS1 and over)
+        held = m.hold_asked or (m.reaction >= Severity.SS1 and over)
         if held and not f.ours:
             m = m._replace(entered=False)  # our own HOLD gave the mode away: nobody has taken it
         gone = bool(m.in_force & (BIT["mode_taken"] | BIT["disarmed"])) or (held and not f.ours)
-        m = m._replace(held=held, off=gone or (held and elapsed >= STOP_TIME + HOLD_TIME))
+        m = m._replace(hold_asked=held, off=gone or (held and elapsed >= STOP_TIME + HOLD_TIME))
     waiting = m.mine and f.armed and (m.tick - m.since) * base.dt < DISARM_TIME
     at_rest = m.state in (State.IDLE, State.FAULT) or (m.state == State.SAFE_STOP and m.off)
     return m._replace(done=m.leaving and at_rest and not waiting)
@@ -115,13 +115,13 @@ def _entered(m: BaseMemory) -> BaseMemory:
         look=NO_LOOK,
         still=0,
         off=False,
-        held=False,
+        hold_asked=False,
         way=path.NO_WAY,
         nearest=np.inf,
         blind=0,
         asked=np.zeros(2),
         did=np.zeros(2),
-        idle=np.zeros(2),
+        unanswered=np.zeros(2),
     )
     if m.state == State.ARMED:
         m = m._replace(v_ref=np.zeros(2), v=0.0, w=0.0, entered=False, mine=False)
@@ -134,15 +134,15 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
     if goal is None:
         return m
     rho = m.goal_rho
-    verdict = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
-    if not verdict and goal.task & Task.POSITION not in (Task.POSITION, Task.X | Task.Y):
-        verdict = "goal: a base goes to a place, wanted x and y"
-    verdict = verdict or turn.refusal(base, goal)
-    if not verdict:
+    refusal = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
+    if not refusal and goal.task & Task.POSITION not in (Task.POSITION, Task.X | Task.Y):
+        refusal = "goal: a base goes to a place, wanted x and y"
+    refusal = refusal or turn.refusal(base, goal)
+    if not refusal:
         rho = goal_distance(base, m.world, goal)
-        verdict = goals.refusal(goal, np.zeros(3), base.reach, rho, m.world.names)
-    if verdict:
-        return m._replace(verdict=verdict.replace("from the base", "from the origin").replace("arm's ", ""))
+        refusal = goals.refusal(goal, np.zeros(3), base.reach, rho, m.world.names)
+    if refusal:
+        return m._replace(refusal=refusal.replace("from the base", "from the origin").replace("arm's ", ""))
     return m._replace(
         goal=goal,
         goal_rho=rho,
@@ -158,5 +158,5 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
 
 
 def goal_distance(base: Base, table: World, goal: Goal) -> F64:
-    """Return the distance (K,) [m] of a goal to each told obstacle, at the height these are cut at."""
+    """Return the distance (K,) [m] of a goal to each known obstacle, at the height these are cut at."""
     return obstacle_table.distance_from(table, np.array([goal.position[0], goal.position[1], base.margins.height]))
