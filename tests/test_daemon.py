@@ -301,7 +301,8 @@ def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
         controller = rig.launch()
         assert controller.wait() == EXIT_CONFIG
     last = controller.text.splitlines()[-1]
-    assert "joint panda_joint4 (id 4): got no answer, wanted a reply on id 0x14" in last
+    assert "joint panda_joint4 (id 4): got no answer; what came: 0x11 panda_joint1, 0x12 panda_joint2" in last
+    assert "wanted a reply on id 0x14" in last
     assert "Traceback" not in controller.text
 
 
