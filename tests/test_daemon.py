@@ -320,9 +320,9 @@ def test_drives_scaled_otherwise_than_the_file_says_are_refused_by_joint_and_reg
         assert controller.wait() == EXIT_CONFIG
         assert rig.report()["max_torque_Nm"]["panda_joint5"] == 0.0
     last = controller.text.splitlines()[-1]
-    assert (
-        f"joint panda_joint5 (id 5): register {register}: got {old.split()[-1].removesuffix('.0')}, wanted 20" in last
-    )
+    got = old.split()[-1].removesuffix(".0")
+    assert f"joint panda_joint5 (id 5): register {register}: got {got} (" in last
+    assert last.endswith("%), wanted 20")
     assert "Traceback" not in controller.text
 
 
