@@ -256,7 +256,7 @@ def test_extended_remote_and_unknown_frames_are_nothing_to_us(wire: Wire) -> Non
 
 @pytest.mark.parametrize("can_id", [1, 2, 3, mit.REGISTER_ID])
 def test_our_identifiers_from_somebody_else_are_a_second_master(wire: Wire, can_id: int) -> None:
-    wire.extra = [frame.pack(can_id, mit.ENABLE)]
+    wire.extra = [frame.pack(can_id, mit.ENABLE if can_id < mit.REGISTER_ID else mit.read_register(3, mit.PMAX))]
     assert flags(wire.cycle()) == Link.FOREIGN_COMMAND
     assert flags(wire.cycle()) == Link.NONE
 

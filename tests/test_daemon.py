@@ -301,7 +301,8 @@ def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
         controller = rig.launch()
         assert controller.wait() == EXIT_CONFIG
     last = controller.text.splitlines()[-1]
-    assert "joint panda_joint4 (id 4): got no answer, wanted a reply on id 0x14" in last
+    assert "joint panda_joint4 (id 4): got no answer; what came: 0x11 panda_joint1, 0x12 panda_joint2" in last
+    assert "wanted a reply on id 0x14" in last
     assert "Traceback" not in controller.text
 
 
@@ -319,9 +320,9 @@ def test_drives_scaled_otherwise_than_the_file_says_are_refused_by_joint_and_reg
         assert controller.wait() == EXIT_CONFIG
         assert rig.report()["max_torque_Nm"]["panda_joint5"] == 0.0
     last = controller.text.splitlines()[-1]
-    assert (
-        f"joint panda_joint5 (id 5): register {register}: got {old.split()[-1].removesuffix('.0')}, wanted 20" in last
-    )
+    got = old.split()[-1].removesuffix(".0")
+    assert f"joint panda_joint5 (id 5): register {register}: got {got} (" in last
+    assert last.endswith("%), wanted 20")
     assert "Traceback" not in controller.text
 
 

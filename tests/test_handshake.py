@@ -105,7 +105,63 @@ def test_an_absent_joint(spec: LinkSpec) -> None:
     drives.mischief = lambda joint, raw: [] if joint == 2 else [raw]
     error = refused(drives, spec)
     assert error.place == "can0: joint joint3 (id 3)"
-    assert (error.got, error.wanted) == ("no answer", "a reply on id 0x13")
+    assert (error.got, error.wanted) == (
+        "no answer; what came: 0x11 joint1, 0x12 joint2",
+        "a reply on id 0x13",
+    )
+
+
+def test_a_drive_that_answers_under_an_identifier_of_its_own_is_named(spec: LinkSpec) -> None:
+    drives = FakeDrives(spec)
+    drives.replies[2] = 0  # as delivered: MST_ID was never set
+    assert refused(drives, spec).got == "no answer; what came: 0x0 (3 frames), 0x11 joint1, 0x12 joint2"
+
+
+def test_two_motors_of_one_identifier_are_refused_by_name(spec: LinkSpec) -> None:
+    drives, twin = FakeDrives(spec), FakeDrives(spec)
+    drives.codes[1], twin.codes[1] = (0x8000, 0x800, 0x800), (0x9000, 0x800, 0x800)
+
+    def both(frames: list[bytes]) -> list[bytes]:
+        only = [raw for raw in frames if raw[:2] == b"\x02\0"]
+        return drives.exchange(frames) + twin.exchange(only)
+
+    with pytest.raises(HandshakeError, match=r"joint joint2 \(id 2\)") as caught:
+        handshake(CanLink(spec, InProcess(both)), listen=0.0, timeout=0.01)
+    assert caught.value.got == "two answers to one command, 0.0002 rad and 1.5627 rad"
+    assert caught.value.wanted == "one motor of this id"
+
+
+def test_an_answer_that_comes_late_once_is_no_second_motor(spec: LinkSpec) -> None:
+    drives, held = FakeDrives(spec), [b""]
+    calls = [0]
+
+    def late_once(joint: int, raw: bytes) -> list[bytes]:
+        if joint != 1:
+            return [raw]
+        calls[0] += 1
+        if calls[0] == 1:
+            held[0] = raw
+            return []
+        before, held[0] = held[0], b""
+        return [before, raw] if before else [raw]
+
+    drives.mischief = late_once
+    handshake(link_to(drives, spec), listen=0.0, timeout=0.01)
+
+
+@pytest.mark.parametrize("fd", [False, True])
+def test_another_program_that_polls_its_own_motor_is_let_be(spec: LinkSpec, fd: bool) -> None:
+    poll = frame.pack(mit.REGISTER_ID, bytes.fromhex("0800cc0000000000"), fd)
+    drives = FakeDrives(spec)
+    drives.mischief = lambda joint, raw: [raw, poll, frame.pack(0x18, bytes(8))]
+    link = link_to(drives, spec)
+    handshake(link, listen=0.0)
+    assert Link(link.read(1, 0, 0.0, 0.0).link) == Link.NONE
+    link.write(Command(Drive.TORQUE, np.zeros(N)))
+    feedback = link.read(2, 0, 0.0, 0.0)
+    assert Link(feedback.link) == Link.NONE
+    assert feedback.replies.tolist() == [1] * N
+    assert link.foreign == 0
 
 
 def test_a_bus_in_trouble_is_named_with_the_absent_joint(spec: LinkSpec) -> None:
@@ -118,9 +174,9 @@ REGISTERS = [
     (mit.MST_ID, "MST_ID", 0x33, "51", "18"),
     (mit.ESC_ID, "ESC_ID", 5, "5", "2"),
     (mit.CTRL_MODE, "CTRL_MODE", 2, "2", "1"),
-    (mit.PMAX, "PMAX", 12.0, "12", "12.5"),
-    (mit.VMAX, "VMAX", 8.0, "8", "45"),
-    (mit.TMAX, "TMAX", 10.0, "10", "54"),
+    (mit.PMAX, "PMAX", 12.0, "12 (-0.5, -4 %)", "12.5"),
+    (mit.VMAX, "VMAX", 8.0, "8 (-37, -82.2 %)", "45"),
+    (mit.TMAX, "TMAX", 10.0, "10 (-44, -81.5 %)", "54"),
     (mit.TMAX, "TMAX", float("nan"), "nan", "54"),
 ]
 
@@ -144,6 +200,21 @@ def test_a_scale_is_compared_as_the_drive_holds_it() -> None:
     for registers in drives.registers:
         registers |= {21: 12.3, 22: 45.1, 23: 54.7}
     assert handshake(link_to(drives, spec), listen=0.0).watchdogs_written == ()
+
+
+@pytest.mark.parametrize(
+    ("holds", "printed"), [(12.566371, 12.5664), (12.566371, 12.56637), (0.1, 0.1), (45.0, 45.0001)]
+)
+def test_a_scale_that_was_printed_with_six_digits_is_the_same(holds: float, printed: float) -> None:
+    spec = spec_of(N)
+    joints = tuple(joint._replace(scale=mit.Scale(12.5, printed, 54.0)) for joint in spec.joints)
+    spec = spec._replace(joints=joints)
+    drives = FakeDrives(spec)
+    for registers in drives.registers:
+        registers[22] = holds
+    handshake(link_to(drives, spec), listen=0.0)
+    drives.registers[0][22] = holds * (1.0 + 1e-5)
+    assert str(refused(drives, spec).got).endswith(" %)")
 
 
 def test_a_register_that_is_not_answered(spec: LinkSpec) -> None:
@@ -236,10 +307,12 @@ def test_a_reply_that_names_another_motor() -> None:
 @pytest.mark.parametrize("can_id", [1, mit.REGISTER_ID])
 def test_a_second_master_heard_while_listening(can_id: int) -> None:
     spec = spec_of(N)
-    waiting = [frame.pack(can_id, mit.DISABLE)]
+    to_motor_2 = mit.read_register(2, mit.PMAX)
+    waiting = [frame.pack(can_id, mit.DISABLE if can_id == 1 else to_motor_2)]
     transport = InProcess(lambda frames: waiting)
     transport.send(b"")
-    with pytest.raises(HandshakeError, match=f"can0: got somebody else's frame on id {can_id:#x}, wanted one master"):
+    whom = f"{can_id:#x}" if can_id == 1 else "0x7ff to motor 2"
+    with pytest.raises(HandshakeError, match=f"can0: got somebody else's frame on id {whom}, wanted one master"):
         handshake(CanLink(spec, transport), listen=0.01)
 
 

@@ -189,7 +189,9 @@ def test_replies_are_lost_and_late_as_often_as_was_said_and_in_order():
 
 
 def test_a_bus_of_frames_of_others_and_a_lost_reply_now_and_then_stops_no_arm():
-    with lab(scenario={"plant": {"reply_loss": 0.002, "reply_late": 0.002, "talker_ids": [0x123, 0x7F]}}) as here:
+    with lab(
+        scenario={"plant": {"reply_loss": 0.002, "reply_late": 0.002, "talker_ids": [0x123, 0x7F, 0x18, 0x7FF]}}
+    ) as here:
         here.running()
         here.run(0.5)
         assert here.memory.state.name == "RUN"

@@ -73,8 +73,14 @@ def link_spec(config: Config) -> LinkSpec:
 
 def open_link(config: Config, path: Path) -> ArmLink:
     """Return the opened bus of a checked config; `path` is its file. Raises RtctlError."""
-    spec, link = link_spec(config), config.link
-    transport = open_transport(
+    spec = link_spec(config)
+    return ArmLink(spec, open_bus(config, spec), 1e-3 * config.link.listen_ms)
+
+
+def open_bus(config: Config, spec: LinkSpec) -> Transport:
+    """Return what moves frames on the bus of a config. Raises RtctlError."""
+    link = config.link
+    return open_transport(
         link.interface,
         link.channel,
         bitrate=link.bitrate,
@@ -83,4 +89,3 @@ def open_link(config: Config, path: Path) -> ArmLink:
         listen=identifiers(spec.joints),
         timeout=link.handshake_s,
     )
-    return ArmLink(spec, transport, 1e-3 * link.listen_ms)

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import experiments, logs, offline, operate, plan
+from rtctl.cli import commission, experiments, logs, offline, operate, plan
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -26,6 +26,7 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
     offline.add_before(commands)
+    commission.add(commands)
     operate.add(commands)
     plan.add(commands)
     offline.add_after(commands)

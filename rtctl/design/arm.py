@@ -52,7 +52,7 @@ def build(config: Config, path: str | Path) -> Robot:
     Raises ConfigError where URDF and config contradict each other or the points leave a link uncovered.
     """
     source, joints = str(path), config.robot.joints
-    body = _body(config, Path(path))
+    body = rigid_body(config, Path(path))
     _refuse_limits(config, body, source)
     home = np.array(config.robot.home_rad)
     found = extremes(config, body)
@@ -118,7 +118,7 @@ def extremes(config: Config, body: RigidBody) -> Extremes:
     """Return gravity torques and inertias over the same POSTURES every time: seeded, uniform within the limits."""
     low = np.array([j.q_min_rad for j in config.robot.joints])
     high = np.array([j.q_max_rad for j in config.robot.joints])
-    still, points = np.zeros(body.n), _no_points()
+    still, points = np.zeros(body.n), no_points()
     samples = np.random.default_rng(0).uniform(low, high, (POSTURES, body.n))
     models = [body.evaluate(q, still, points) for q in (np.array(config.robot.home_rad), *samples)]
     g = np.abs([m.g for m in models])
@@ -126,7 +126,7 @@ def extremes(config: Config, body: RigidBody) -> Extremes:
     return Extremes(g.max(axis=0), g[0], A.max(axis=0), A[0])
 
 
-def _body(config: Config, path: Path) -> RigidBody:
+def rigid_body(config: Config, path: Path) -> RigidBody:
     """Return the rigid body; complaints about the URDF are turned to name the key of the config."""
     urdf = urdf_file(config.robot.urdf, path)
     base = config.robot.base_pose
@@ -304,7 +304,7 @@ def _filters(c: Config, body: RigidBody, home: F64) -> Filters:
     )
     kinds, of = np.unique(np.stack(joint_filter[:3], axis=1), axis=0, return_inverse=True)  # equal drives, one design
     joint_P = design_joint(JointParams(kinds[:, 0], kinds[:, 1], kinds[:, 2], e.joint_velocity), dt, dt)[of.ravel()]
-    J = body.evaluate(home, np.zeros(n), _no_points()).J
+    J = body.evaluate(home, np.zeros(n), no_points()).J
     tip = tip_params(J, joint_P, e.acceleration_m_s2, e.acceleration_rad_s2)
     ratio = max(1, round(c.loop.servo_hz / c.loop.model_hz))
     # joints are predicted to now, so a pose has no age
@@ -338,5 +338,5 @@ def _velocity_tolerance(c: Config) -> F64:
     return bound
 
 
-def _no_points() -> Points:
+def no_points() -> Points:
     return Points(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), ())

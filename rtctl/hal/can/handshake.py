@@ -5,6 +5,7 @@ with a simulator as it does on a bus.
 """
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from rtctl.errors import HandshakeError
 from rtctl.hal.can.link import CanLink
-from rtctl.hal.can.transport import SocketCan
+from rtctl.hal.can.transport import PythonCan, SocketCan
 from rtctl.hal.can.turns import position
 from rtctl.protocol import frame, mit
 from rtctl.types import F64, Link
@@ -20,6 +21,8 @@ from rtctl.types import F64, Link
 WATCHDOG_MAX_S = 0.1
 WATCHDOG_MIN_PERIODS = 3
 QUEUE_MIN = 64  # frames; the default of a CAN interface, 10, is less than one cycle of two seven-joint arms
+LINGER_S = 0.005  # after all have answered: a second motor with the same identifier answers just behind the first
+PRINTED = 5e-6  # of a scale: what is lost where a float32 was printed with six digits
 _IFF_UP = 1
 _NET = Path("/sys/class/net")
 
@@ -94,12 +97,16 @@ def _identity(link: CanLink) -> list[tuple[int, list[float]]]:
 
 
 def _compare(place: str, register: mit.Register, wanted: float) -> None:
-    """Refuse a register that differs; a float as the drive holds it, in 32 bits."""
-    real = register.rid in mit.FLOATS
-    got = register.real if real else register.number
-    if got != (float(np.float32(wanted)) if real else wanted):
-        name = mit.REGISTERS[register.rid]
-        raise HandshakeError(f"{place}: register {register.rid} {name}", f"{got:g}", f"{wanted:g}")
+    """Refuse a register that differs; a float by more than is lost where a float32 was printed."""
+    place = f"{place}: register {register.rid} {mit.REGISTERS[register.rid]}"
+    if register.rid not in mit.FLOATS:
+        if register.number != wanted:
+            raise HandshakeError(place, f"{register.number:g}", f"{wanted:g}")
+        return
+    off = register.real - wanted
+    if not abs(off) <= PRINTED * wanted:  # also one that is not finite
+        share = f" ({off:+.4g}, {100.0 * off / wanted:+.3g} %)" if np.isfinite(off) else ""
+        raise HandshakeError(place, f"{register.real:.7g}{share}", f"{wanted:.7g}")
 
 
 def _arm_watchdogs(talk: "_Talk") -> tuple[str, ...]:
@@ -169,21 +176,57 @@ class _Talk:
             self.link.take_stranger(raw)
             if self.link.is_ours(raw):
                 one = frame.unpack(raw)
-                raise HandshakeError(self.link.spec.place, f"somebody else's frame on id {one.can_id:#x}", "one master")
+                to = f" to motor {one.data[0] | one.data[1] << 8}" if one.can_id == mit.REGISTER_ID else ""
+                got = f"somebody else's frame on id {one.can_id:#x}{to}"
+                raise HandshakeError(self.link.spec.place, got, "one master")
         return joint
 
     def stop_frames(self) -> list[tuple[bytes, bytes]]:
-        """Send the stop frame to all joints; return each one's reply, raw and as data."""
+        """Send the stop frame to all joints; return each one's reply, raw and as data.
+
+        Raises HandshakeError for a joint that is silent, and for an identifier under which two motors answer.
+        """
         replies: dict[int, tuple[bytes, bytes]] = {}
+        twice: set[int] | None = None
         for _ in range(self.attempts):
             # All joints each time, so that a drive in lockstep gets whole cycles.
-            self._send([self.link.encode(j, mit.DISABLE) for j in range(len(self.link.spec.joints))])
-            replies |= {j: (raw, self._data(j, raw)) for j, raw in self._gather(set(self._everyone()), None).items()}
-            if len(replies) == len(self.link.spec.joints):
+            self._send([self.link.encode(j, mit.DISABLE) for j in self._everyone()])
+            answers = self._gather(set(self._everyone()), None)
+            many = {j for j, raws in answers.items() if len(raws) > 1}
+            twice = many if twice is None else twice & many
+            replies |= {j: (raws[-1], self._data(j, raws[-1])) for j, raws in answers.items()}
+            if len(replies) == len(self.link.spec.joints) and not many:  # else it may be an answer that was late
                 return [replies[j] for j in self._everyone()]
-        absent = min(set(self._everyone()) - set(replies))
-        wanted = f"a reply on id {self.link.spec.joints[absent].reply_id:#x}"
-        raise HandshakeError(self.place(absent), f"no answer{self._trouble()}", wanted)
+        absent = set(self._everyone()) - set(replies)
+        if absent:
+            wanted = f"a reply on id {self.link.spec.joints[min(absent)].reply_id:#x}"
+            raise HandshakeError(self.place(min(absent)), f"no answer{self._trouble()}{self._overheard()}", wanted)
+        if twice:
+            angles = " and ".join(self._angle(min(twice), raw) for raw in answers[min(twice)][:2])
+            raise HandshakeError(
+                self.place(min(twice)), f"two answers to one command, {angles}", "one motor of this id"
+            )
+        return [replies[j] for j in self._everyone()]
+
+    def _angle(self, joint: int, raw: bytes) -> str:
+        reply = mit.decode_reply(self._data(joint, raw)[: mit.LENGTH], self.link.spec.joints[joint].scale)
+        return f"{0.0 if reply is None else reply.p:.4f} rad"
+
+    def _overheard(self) -> str:
+        """Return in words which frames came, those of others included: for an answer that is missing."""
+        transport = self.link.transport
+        if isinstance(transport, SocketCan | PythonCan):  # the kernel kept them from us so far
+            transport.hear_all()
+            self._send([self.link.encode(j, mit.DISABLE) for j in self._everyone()])
+            self.received += transport.collect(2 * len(self.link.spec.joints), self.timeout)
+        names = {joint.reply_id: joint.name for joint in self.link.spec.joints}
+        counts: dict[int, int] = {}
+        for raw in self.received:
+            can_id = int.from_bytes(raw[:4], "little")
+            counts[can_id] = counts.get(can_id, 0) + (can_id <= frame.SFF_MASK)
+        came = [f"{i:#x} {names.get(i, f'({n} frames)')}" for i, n in sorted(counts.items()) if n]
+        more = f" and {len(came) - 16} more" if len(came) > 16 else ""
+        return f"; what came: {', '.join(came[:16])}{more}" if came else ""
 
     def read(self, rid: int) -> list[mit.Register]:
         """Return one register of every joint."""
@@ -197,8 +240,8 @@ class _Talk:
         for _ in range(self.attempts):
             missing = {j for j in payloads if j not in answers}
             self._send([self.link.encode(j, payloads[j], can_id=mit.REGISTER_ID) for j in sorted(missing)])
-            for j, raw in self._gather(missing, (rid, write)).items():
-                register = mit.decode_register(self._data(j, raw)[: mit.LENGTH])
+            for j, raws in self._gather(missing, (rid, write)).items():
+                register = mit.decode_register(self._data(j, raws[-1])[: mit.LENGTH])
                 if register is not None:
                     answers[j] = register
             if len(answers) == len(payloads):
@@ -213,19 +256,26 @@ class _Talk:
     def _send(self, frames: list[bytes]) -> None:
         self.sent += self.link.transport.send_all(frames)
 
-    def _gather(self, missing: set[int], register: tuple[int, bool] | None) -> dict[int, bytes]:
-        """Return one answer of each joint, those that came in time; `register` names the one awaited, if any."""
-        answers: dict[int, bytes] = {}
-        deadline = time.monotonic() + self.timeout
+    def _gather(self, missing: set[int], register: tuple[int, bool] | None) -> dict[int, list[bytes]]:
+        """Return the answers of each joint, those that came in time; `register` names the one awaited, if any."""
+        answers: dict[int, list[bytes]] = {}
+        transport, deadline = self.link.transport, time.monotonic() + self.timeout
         while missing - set(answers):
-            frames = self.link.transport.collect(len(missing) - len(answers), self.timeout)
-            for raw in frames:
-                joint = self._account(raw)
-                if joint is not None and self._register_of(joint, raw) == register:
-                    answers[joint] = raw
+            frames = transport.collect(len(missing) - len(answers), self.timeout)
+            self._sort(frames, register, answers)
             if not frames or time.monotonic() > deadline:
                 break
+        while register is None and transport.wait(LINGER_S) and time.monotonic() < deadline:
+            self._sort(transport.receive(), register, answers)
         return answers
+
+    def _sort(
+        self, frames: Sequence[bytes], register: tuple[int, bool] | None, answers: dict[int, list[bytes]]
+    ) -> None:
+        for raw in frames:
+            joint = self._account(raw)
+            if joint is not None and self._register_of(joint, raw) == register:
+                answers.setdefault(joint, []).append(raw)
 
     def _register_of(self, joint: int, raw: bytes) -> tuple[int, bool] | None:
         """Return which register a reply tells, or None for a state; late answers of either kind come to nothing.

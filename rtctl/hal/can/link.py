@@ -74,7 +74,8 @@ class CanLink:
         self._size = frame.CANFD_MTU if spec.fd else frame.CAN_MTU
         self._padding = bytes(self._size - 8 - self._length)
         self._joint_of = {_word(joint.reply_id): j for j, joint in enumerate(spec.joints)}
-        self._ours = frozenset(_word(i) for i in (*(joint.can_id for joint in spec.joints), mit.REGISTER_ID))
+        self._ours = frozenset(_word(joint.can_id) for joint in spec.joints)
+        self._motors = frozenset(joint.can_id.to_bytes(2, "little") for joint in spec.joints)
         self.turns: tuple[int, ...] = (0,) * n
         self.turn((0,) * n)
         batch.warm(self._cycle)
@@ -173,8 +174,11 @@ class CanLink:
         return joint_reply(data[: mit.LENGTH], self.spec.joints[joint].scale, self._fields[joint])
 
     def is_ours(self, raw: bytes) -> bool:
-        """True if a frame carries an identifier that only this program may send."""
-        return raw[:4] in self._ours
+        """True if a frame is one that only this program may send: to one of our motors.
+
+        A frame on the identifier of registers says in its first two bytes whom it is for; there are other motors.
+        """
+        return raw[:4] in self._ours or (raw[:4] == _REGISTERS and raw[8:10] in self._motors and raw[4] > 1)
 
     def _take_whole(self, slot: int, asked: int) -> bool:
         """Take a cycle in which all is as it should be; return False, with nothing taken, if anything is not."""
@@ -234,8 +238,11 @@ class CanLink:
         try:
             one = frame.unpack(raw)
         except ValueError:
-            self.corrupt += 1
-            self._flags |= Link.CORRUPT
+            if raw[:4] in self._ours or len(raw) < frame.CAN_MTU:  # else it was never for us
+                self.corrupt += 1
+                self._flags |= Link.CORRUPT
+            else:
+                self.ignored += 1
             return
         if one.error:
             self._note_error(one)
@@ -292,3 +299,6 @@ class CanLink:
 def _word(can_id: int) -> bytes:
     """Return the first four bytes of a data frame with an 11-bit identifier."""
     return frame.HEAD.pack(can_id, 0, 0)[:4]
+
+
+_REGISTERS = _word(mit.REGISTER_ID)

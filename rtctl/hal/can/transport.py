@@ -120,6 +120,10 @@ class SocketCan(_Socket):
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0)
         return sock
 
+    def hear_all(self) -> None:
+        """Let all data frames in, those of others too: to say what came where an answer is missing."""
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", 0, 0))
+
     def reopen(self) -> bool:
         """Try once to open the interface anew after it went away; True if that worked."""
         self._bus.shutdown()
@@ -243,6 +247,10 @@ class PythonCan:
         elif self._bus.state is can.BusState.PASSIVE:
             flags |= Link.ERROR_PASSIVE
         return int(flags)
+
+    def hear_all(self) -> None:
+        """Let all frames in, see `SocketCan.hear_all`."""
+        self._bus.set_filters(None)
 
     def reopen(self) -> bool:
         """An adapter is not opened twice by the loop: that may take seconds."""

@@ -127,10 +127,11 @@ def test_the_kernel_filters_what_is_not_for_us_before_it_wakes_us(vcan: str) -> 
 
 @pytest.mark.parametrize("can_id", [1, N, mit.REGISTER_ID])
 def test_a_second_master_is_seen(vcan: str, can_id: int) -> None:
+    data = mit.ENABLE if can_id < mit.REGISTER_ID else mit.read_register(N, mit.PMAX)
     with linked(vcan, spec_of(N)) as link, raw_socket(vcan) as somebody:
-        somebody.send(frame.pack(can_id, mit.ENABLE))
+        somebody.send(frame.pack(can_id, data))
         assert flags(Loop(link).hear()) == Link.FOREIGN_COMMAND
-        timer = threading.Timer(0.05, lambda: somebody.send(frame.pack(can_id, mit.ENABLE)))
+        timer = threading.Timer(0.05, lambda: somebody.send(frame.pack(can_id, data)))
         timer.start()
         with pytest.raises(HandshakeError, match="one master"):
             handshake(link, listen=5.0)
