@@ -135,14 +135,14 @@ def test_an_encoder_that_sticks_at_rest_is_seen_by_the_torque_that_moves_its_joi
         while here.memory.state == State.RUN and here.simulator.time < 1.0:
             here.step()
         assert faults.names(here.servo.faults_seen) == ("encoder_stuck",)
-        assert np.abs(here.simulator.truth().qd).max() < 1.0
+        assert np.abs(here.simulator.truth().qd).max() < 1.2
 
 
 def test_an_arm_that_is_held_while_a_goal_pushes_has_no_stuck_encoder():
     arm = Standing(arm=prepared(robot()._replace(safety=robot().safety._replace(innovation_max=1e9))))
     arm.tick(Request(goal=goal(arm.memory, [0.5, 0.3, 0.5])))
     arm.ticks(300)
-    assert np.abs(arm.memory.qdd * np.diag(arm.memory.model.A))[4] > arm.robot.safety.friction[4]
+    assert np.abs(arm.memory.sent[0] - arm.memory.model.g)[4] > arm.robot.safety.friction[4]
     assert arm.state() == State.RUN
 
 

@@ -101,11 +101,12 @@ def corrupt(*pattern: int) -> Callable[[Arm], list[dict[str, Any]]]:
 
 
 def beyond(excess: float) -> Callable[[Arm], list[dict[str, Any]]]:
-    """A joint that is pushed over its limit at 1 rad/s."""
+    """A joint that is pushed over its limit at 1 rad/s; what the others must feel of it is not looked at."""
 
     def slots(arm: Arm) -> list[dict[str, Any]]:
         low = robot().q_min[3]
-        arm.__init__(arm.memory.state, np.where(np.arange(7) == 3, low + 0.01, PANDA_HOME), arm.robot)  # type: ignore[misc]
+        slack = prepared(arm.robot._replace(safety=arm.robot.safety._replace(friction=np.full(7, np.inf))))
+        arm.__init__(arm.memory.state, np.where(np.arange(7) == 3, low + 0.01, PANDA_HOME), slack)  # type: ignore[misc]
         steps = round((0.01 + excess) / 1e-3)
         return [{"q": arm.q - joint(3, 1e-3 * k), "qd": joint(3, -1.0)} for k in range(1, steps + 1)]
 

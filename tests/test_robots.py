@@ -229,7 +229,11 @@ def test_the_tick_expects_the_acceleration_that_friction_leaves_of_the_torque_it
     first = at_rest(r, r.home)
     gravity = first.model.g
     running = first._replace(
-        state=State.RUN, sent=np.tile(gravity, (4, 1)), pace=1.0, joints=first.joints._replace(qd=qd)
+        state=State.RUN,
+        sent=np.tile(gravity, (4, 1)),
+        speed_scale=1.0,
+        joints=first.joints._replace(qd=qd),
+        qd_measured=qd,
     )
     m, command, _ = tick(r, running, healthy(r.home, 0, qd=qd, tau=gravity), Request())
     assert m.state == State.RUN

@@ -51,7 +51,7 @@ _SCALED = int(LimitFlag.MOTION_SCALED)
 REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
 _BARE = (  # of Robot
     "q_min", "q_max", "qd_max", "tau_max", "tau_rate", "tau_lsb", "braking", "viscous", "q_rest", "dt", "model_dt",
-    "carry", "escape",
+    "carry", "escape", "payload_max", "friction_max", "noticeable", "tolerance", "tolerance_rot",
 )  # fmt: skip
 
 # rows of Law.torques, (7, n) [Nm]; the first five as the record has them

@@ -103,13 +103,42 @@ HOT = np.dtype(
             ("limit_flags", _INT),  # types.LimitFlag of the last tick
             ("slew_follows_echo", _INT),  # the slew starts from the echo: the drive does not give what it is sent
             ("speed_scale", _REAL),  # fraction of qd_max that joints may have
+            # disturbance
+            ("external", _REAL, _JOINT),  # [Nm] torque that neither drives nor model give; see `disturbance`
+            ("lasting", _REAL, _JOINT),  # [Nm] the part of it that lasts
+            ("noticed", _INT),  # it is more than rounding: what lasts is carried, from now on
+            ("settled", _INT),  # and stays as it is: the arm is at rest where it shall be
+            ("qd_measured", _REAL, _JOINT),  # [rad/s] of the last feedback
+            ("external_moving", _REAL, _JOINT),  # [Nm] as slow, hardly following where an encoder stands still
+            ("struck", _INT),  # the joint before the link that something ran into, -1 none
         ],
     )
 )
 _NAMES = frozenset(HOT.names or ())
 _COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes")
-_JOINTS = ("onset", "qdd", "q_previous", "age_previous", "q_rest", "tau_obstacles")
-_FLAGS = ("off", "recovering", "outside", "leaving", "done", "evaluated", "slew_follows_echo")
+_JOINTS = (
+    "onset",
+    "qdd",
+    "q_previous",
+    "age_previous",
+    "q_rest",
+    "tau_obstacles",
+    "external",
+    "lasting",
+    "qd_measured",
+    "external_moving",
+)
+_FLAGS = (
+    "off",
+    "recovering",
+    "outside",
+    "leaving",
+    "done",
+    "evaluated",
+    "slew_follows_echo",
+    "noticed",
+    "settled",
+)
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 
 

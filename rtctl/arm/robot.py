@@ -53,6 +53,9 @@ class Robot(NamedTuple):
     tau_rated: F64  # (n,) [Nm] rating of the joint
     tau_rate: F64  # (n,) [Nm/s]
     tau_lsb: F64  # (n,) [Nm] rounding of the torque a drive echoes
+    payload_max: float  # [kg] at the tip, that is carried untold
+    friction_max: F64  # (n,) [Nm] the same of friction, and of what the drives are wrong by
+    noticeable: F64  # (n,) [Nm] more than this of an external torque is more than rounding
     viscous: F64  # (n,) [Nms/rad] friction of the joints, for predictions alone: it damps, so it is not compensated
     braking: F64  # (n,) [rad/s2] with which a joint is brought to rest before its limit
     home: F64  # (n,) [rad]

@@ -159,21 +159,26 @@ def correct(c: RecordRow, m: RecordRow, model: Model) -> None:
 
 
 @kernel
-def _monitored(c: RecordRow, m: RecordRow, f: Feedback, A: F64) -> tuple[F64, int]:
+def _monitored(c: RecordRow, m: RecordRow, f: Feedback, model: Model) -> tuple[F64, int]:
     """Return the monitors of the encoders after this tick, and their flags."""
-    n = f.q.shape[0]
+    n, qdd = f.q.shape[0], m.qdd.copy()
+    if m.noticed != 0:  # one that stands still is held by what is external to it and was not while it moved
+        for i in range(n):
+            qdd[i] = (m.external_moving[i] - m.external[i]) / model.A[i, i]
     return encoder_flags(
         m.encoder_monitors[:, :n].copy(),
         f,
         PreviousPositions(m.q_previous[:n].copy(), m.age_previous[:n].copy(), c.dt * (1 + f.missed)),
-        ExpectedMotion(m.qdd[:n].copy(), A),
+        ExpectedMotion(qdd[:n], model.A),
         EncoderBounds(c.safety_friction[:n].copy(), c.safety_velocity_tolerance[:n].copy()),
         c.dt,
     )
 
 
 @kernel
-def detect_faults(c: RecordRow, m: RecordRow, f: Feedback, A: F64, around: Surroundings, implausible: bool) -> None:
+def detect_faults(
+    c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, implausible: bool
+) -> None:
     """Write the faults that are present and in force, and what the detectors keep; f: plausible feedback."""
     n = f.q.shape[0]
     powered = drives_torque(m)
@@ -189,7 +194,7 @@ def detect_faults(c: RecordRow, m: RecordRow, f: Feedback, A: F64, around: Surro
     )
     monitors, flags = np.zeros((5, n)), found.flags
     if active:
-        monitors, more = _monitored(c, m, f, A)
+        monitors, more = _monitored(c, m, f, model)
         flags |= more
     evidence = Evidence(
         flags,

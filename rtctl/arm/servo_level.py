@@ -15,6 +15,7 @@ from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
+from rtctl.arm.loads import loaded, observe
 from rtctl.arm.memory import HOT
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
@@ -142,19 +143,19 @@ def _move(around: Surroundings, dt: float) -> None:
 def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, asked: Asked) -> int:
     """Run the first half of a tick; return what Python must do before the other, and whether the obstacles moved."""
     plausible, implausible = plausible_feedback(c, m, f)
-    moved = DONE
+    moved, elapsed = DONE, c.dt * (1 + min(f.missed, MISSED_MAX))
     if asked.stage == START:
         m.tick = m.tick + 1
-        elapsed = c.dt * (1 + min(f.missed, MISSED_MAX))
         if asked.bits & WORLD == 0 and any_set(around.moving):
             _move(around, elapsed)
             moved = MOVED
         if predict(c, m, plausible, model, elapsed):
             return MODEL | moved
     correct(c, m, model)
+    observe(c, m, plausible, model, elapsed)
     if m.has_goal != 0 and (moved or asked.bits & WORLD or m.goal_task & _POSITION != _POSITION):
         around.goal_rho[:] = distances_from(around.obstacles, point_along(m.goal_task, m.goal.copy(), m.x))
-    detect_faults(c, m, plausible, model.A, around, implausible)
+    detect_faults(c, m, plausible, model, around, implausible)
     if asked.bits & REQUEST or not _uneventful(c, m, all_equal(f.drive, 1)):
         return ATTENTION | moved
     if m.state == _IDLE or m.state == _FAULT or (m.state == _SAFE_STOP and m.off != 0):
@@ -167,10 +168,10 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surrou
 @kernel
 def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
-    n = f.q.shape[0]
+    n, noticed = f.q.shape[0], m.noticed != 0
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
     if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp or fade, then torque off
-        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g)
+        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g - m.lasting[:n] if noticed else model.g)
     command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
     bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
     limited, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
@@ -178,7 +179,8 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
     m.sent[1:, :n], m.sent[0, :n] = m.sent[:3, :n].copy(), tau
     m.qdd[:n] = 0.0
     if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
-        m.qdd[:n] = acceleration(model.A_inv, tau, model.h, model.g, c.viscous[:n].copy(), qd)
+        viscous, g = c.viscous[:n].copy(), model.g - m.external[:n] if noticed else model.g
+        m.qdd[:n] = acceleration(model.A_inv, tau, model.h, g, viscous, qd)
     m.limit_flags, m.slew_follows_echo = limited.flags | m.limit_flags, 1 if follows else 0
     return command, limited.tau_wanted
 
@@ -191,26 +193,8 @@ def _act(
     c, n = arm.constants[0], f.q.shape[0]
     e, e_rot, q_rest = wanted(c, m, model, asked.bits & CHOSEN != 0)
     q, qd, x, R, xd, omega = m.q[:n].copy(), m.qd[:n].copy(), m.x.copy(), m.R.copy(), m.xd.copy(), m.omega.copy()
-    at = model
-    if c.carry == 0.0:  # the points have not moved either
-        at = Model(
-            q,
-            model.qd,
-            model.A,
-            model.A_inv,
-            model.h,
-            model.g,
-            model.x,
-            model.R,
-            model.J,
-            model.Jdqd,
-            model.P,
-            model.Jp,
-            model.B,
-            model.Lambda_inv,
-            model.own_rho,
-            model.own_row,
-        )
+    lasting = m.lasting[:n].copy() if m.noticed != 0 else np.zeros(n)
+    at = loaded(model, lasting, q if c.carry == 0.0 else model.q)  # without carrying, points have not moved either
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
     _, m.limit_flags = law(

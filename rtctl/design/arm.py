@@ -32,6 +32,7 @@ from rtctl.types import F64, Shape
 from rtctl.world.primitives import distance
 
 POSTURES = 256  # sampled for torque and inertia extremes
+NOTICEABLE = 0.002  # of the rating: an external torque that is less is what rounding of torques leaves
 FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
 VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
 P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
@@ -77,6 +78,9 @@ def build(config: Config, path: str | Path) -> Robot:
         tau_max=config.safety.torque_ratio * tau_rated,
         tau_rated=tau_rated,
         tau_rate=np.array([j.tau_rate_Nm_s for j in joints]),
+        payload_max=config.robot.payload_max_kg,
+        friction_max=config.safety.friction_ratio * tau_rated,
+        noticeable=NOTICEABLE * tau_rated,
         viscous=np.array([j.friction_Nms_rad for j in joints]),
         tau_lsb=np.array([2.0 * s.t_max / (2**T_BITS - 1) for s in rules.scales(config)]),
         braking=np.array([j.qd_max_rad_s for j in joints]) / config.avoid.joint_braking_s,

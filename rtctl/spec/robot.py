@@ -62,6 +62,9 @@ class RobotTable(Table, frozen=True, kw_only=True):
     home_rad: Annotated[Angles, Meta(description="rest posture: default start and null-space attractor")]
     joints: Annotated[tuple[Joint, ...], Meta(min_length=1, max_length=15)]
     base_pose: BasePose = BasePose()
+    payload_max_kg: Annotated[
+        float, Meta(ge=0.0, le=200.0, description="largest payload at the tip, carried without being told")
+    ] = 0.0
 
 
 class Loop(Table, frozen=True, kw_only=True):
@@ -186,6 +189,9 @@ class Safety(Table, frozen=True, kw_only=True):
     stale_stop_ms: Annotated[Milliseconds, Meta(description="feedback older than this: latched stop")]
     torque_ratio: Annotated[float, Meta(ge=0.1, le=1.0, description="of tau_max that may be sent")] = 0.95
     torque_error_ratio: Annotated[float, Meta(ge=0.002, le=0.5, description="of tau_max, sent against echoed")] = 0.05
+    friction_ratio: Annotated[
+        float, Meta(ge=0.0, le=0.5, description="of tau_max: friction that is compensated without being told")
+    ] = 0.05
     speed_ratio: Annotated[float, Meta(ge=1.0, le=1.5, description="of qd_max, beyond it a fault")] = 1.2
     limit_excess_rad: Annotated[float, Meta(ge=0.0, le=0.2, description="beyond a joint limit, then a fault")] = 0.02
     obstacle_stale_s: Annotated[

@@ -1,0 +1,100 @@
+"""What the arm carries beside its own weight, in the memory of the servo level; the equations are `disturbance`'s.
+
+m, c: as in `sensing`.
+"""
+
+import math
+
+import numpy as np
+
+from rtctl.arm.disturbance import (
+    FOLLOWING,
+    RESTING,
+    STICKING,
+    beyond,
+    carried,
+    observed,
+    rounding,
+    settled,
+    slow_part,
+)
+from rtctl.arm.model import Model
+from rtctl.arm.sensing import drives_torque
+from rtctl.arm.target import target_of
+from rtctl.arm.task import task_error
+from rtctl.kernel import kernel
+from rtctl.kernel.reductions import norm
+from rtctl.types import F64, Feedback, RecordRow, State
+
+FINE, FINE_ROT = 1e-3, 5e-3  # [m], [rad] a goal's tolerance below them does not make the arm push on
+
+# numbers of the enumeration, as compiled code reads them
+_ARMED, _RUN = int(State.ARMED), int(State.RUN)
+
+
+@kernel
+def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: float) -> None:
+    """Observe what pushes the joints while the arm is free to move; f: plausible, `elapsed` [s] after the last one."""
+    n = f.q.shape[0]
+    qd = f.qd.copy()
+    if not drives_torque(m) or m.state == _ARMED:  # brakes may hold it: nothing is to be learnt
+        m.external[:n], m.lasting[:n], m.external_moving[:n], m.qd_measured[:n] = 0.0, 0.0, 0.0, qd
+        m.noticed, m.settled = 0, 0
+        return
+    load, resting = np.empty(n), True
+    for i in range(n):
+        if not (f.replies[i] > 0 and np.isfinite(qd[i])):
+            qd[i] = m.qd_measured[i]
+        load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i]
+        resting = resting and abs(qd[i]) < RESTING
+    # the speed measured now ends the period in which the command before the last one was applied
+    before, tau = m.qd_measured[:n].copy(), m.sent[1, :n].copy()
+    external = observed(m.external[:n].copy(), model.A, qd, before, load, tau, elapsed)
+    m.external[:n], m.qd_measured[:n] = external, qd
+    if m.state != _RUN:
+        return  # a stop goes on with what was known
+    m.settled = 1 if settled(m.settled != 0, resting, _error(c, m)) else 0
+    if m.settled == 0 or m.noticed == 0:
+        bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
+        m.lasting[:n] = slow_part(m.lasting[:n].copy(), external, bound, elapsed)
+    least = c.noticeable[:n].copy()
+    if m.noticed == 0 and beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least)):
+        m.noticed = 1
+    follow = 1.0 - math.exp(-FOLLOWING * elapsed)
+    drift = 1.0 - math.exp(-STICKING * elapsed)
+    for i in range(n):
+        moved = f.replies[i] > 0 and f.q[i] != m.q_previous[i]
+        m.external_moving[i] += (follow if moved else drift) * (external[i] - m.external_moving[i])
+
+
+@kernel
+def _error(c: RecordRow, m: RecordRow) -> float:
+    """Return how far the tip is from where it shall be, in tolerances."""
+    target = target_of(m, m.has_goal != 0)
+    e, e_rot = task_error(target.task, target.axis, target.position, target.wxyz, m.x.copy(), m.R.copy())
+    near = max(target.tolerance if target.tolerance > 0.0 else c.tolerance, FINE)
+    near_rot = max(target.tolerance_rot if target.tolerance_rot > 0.0 else c.tolerance_rot, FINE_ROT)
+    return max(norm(e) / near, norm(e_rot) / near_rot)
+
+
+@kernel
+def loaded(model: Model, torque: F64, q: F64) -> Model:
+    """Return the model that carries an external torque (n,) [Nm] as gravity, its points those of q (n,) [rad]."""
+    return Model(
+        q,
+        model.qd,
+        model.A,
+        model.A_inv,
+        model.h,
+        model.g - torque,
+        model.x,
+        model.R,
+        model.J,
+        model.Jdqd,
+        model.P,
+        model.Jp,
+        model.B,
+        model.Lambda_inv,
+        model.own_rho,
+        model.own_row,
+    )

@@ -1,0 +1,130 @@
+"""Payload and friction that nobody told of: seen by the momentum observer, carried by the law, judged by the plant."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rtctl.arm import faults
+from rtctl.arm.disturbance import BANDWIDTH, LASTING, beyond, carried, observed, rounding, settled, slow_part
+from rtctl.kernel.rotations import quat_of
+from tests.lab import ROOT, Lab, lab
+
+
+class Case(NamedTuple):
+    """What an arm carries and how it rubs, and how far it goes [m] from its home with its orientation kept."""
+
+    payload: float  # [kg] at the tip
+    coulomb: Sequence[float] | float  # [Nm]
+    way: Sequence[float]
+
+
+CASES = {
+    "openarm": Case(0.5, [0.3] * 4 + [0.06] * 3, (0.04, 0.05, 0.06)),
+    "panda": Case(1.0, 0.5, (0.15, 0.2, -0.1)),
+    "planar4": Case(1.0, 0.5, (-0.2, 0.15, 0.0)),
+    "puma560": Case(1.0, 0.5, (-0.1, 0.15, -0.15)),
+    "ur5": Case(1.0, 0.5, (-0.1, 0.2, -0.1)),
+}
+
+
+def until(here: Lab, what: Any, seconds: float) -> float:
+    """Play slots until the memory is so; return the time [s] that it took. Fails when it takes longer."""
+    for k in range(round(seconds / here.robot.dt)):
+        if what(here.memory):
+            return k * here.robot.dt
+        here.step()
+    raise AssertionError("not within its time")
+
+
+def arrived(name: str, here: Lab) -> float:
+    """Ask the arm for the goal of its case; return the time [s] until it says that it is there."""
+    x, wxyz = here.simulator.truth().tip, quat_of(here.memory.tip.R)
+    here.ask(x + np.array(CASES[name].way), wxyz)
+    return until(here, lambda m: m.status.name == "ARRIVED", 6.0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_nobody_told_of_is_carried_to_the_goal(name: str):
+    """Its time is compared with that of the same arm as its model is; place, angle and rest are the plant's truth."""
+    case, path = CASES[name], ROOT / "configs" / f"{name}.toml"
+    with lab(path=path) as here:
+        plain = arrived(name, here.running())
+        assert not here.memory.noticed
+    plant = {"payload_kg": case.payload, "coulomb_Nm": case.coulomb}
+    with lab(path=path, scenario={"plant": plant}) as here:
+        here.running()
+        x, R = here.simulator.truth().tip.copy(), here.memory.tip.R.copy()
+        assert arrived(name, here) < plain + 2.0
+        until(here, lambda m: m.settled, 12.0)
+        here.run(1.5)  # the last of the way
+        tips = []
+        for _ in range(500):
+            here.step()
+            tips.append(here.simulator.plant.tip_pose()[0])
+        assert np.ptp(tips, axis=0).max() < 0.5e-3
+        truth = here.simulator.truth()
+        assert np.linalg.norm(truth.tip - x - np.array(case.way)) < 3e-3
+        assert 2.0 * np.arccos(min(abs(truth.tip_wxyz @ quat_of(R)), 1.0)) < 1e-2
+        assert faults.names(here.servo.faults_seen) == ()
+        assert {name for _, name, _ in here.servo.events} <= {"state", "moving", "arrived"}
+
+
+# ---- the observer alone
+
+
+def test_the_observer_finds_a_torque_on_a_pendulum_from_its_motion_alone():
+    """A point mass m at l with inertia A = m l^2, integrated here: A qdd + m g l sin q = tau + external."""
+    A, weight, dt = 0.8, 3.0, 1e-3
+    q, qd, r, external, tau = 0.3, 0.0, np.zeros(1), 1.7, 2.0
+    for k in range(round(8.0 / BANDWIDTH / dt)):
+        before = qd
+        load = weight * np.sin(q)
+        qd += dt * (tau + external - load) / A
+        q += dt * qd
+        r = observed(r, np.array([[A]]), np.array([qd]), np.array([before]), np.array([load]), np.array([tau]), dt)
+        assert r[0] == pytest.approx(external * (1.0 - np.exp(-BANDWIDTH * dt * (k + 1))), abs=1e-9)
+    assert r[0] == pytest.approx(external, abs=2e-3)
+
+
+def test_what_is_carried_stays_within_what_was_declared():
+    d = np.zeros(2)
+    for _ in range(5000):
+        d = slow_part(d, np.array([5.0, -0.3]), np.array([2.0, 2.0]), 1e-3)
+    np.testing.assert_allclose(d, [2.0, -0.3], atol=1e-6)
+
+
+def test_the_bound_is_the_weight_of_the_payload_at_its_lever_and_friction():
+    """A lever of 0.5 m about a horizontal axis, and an upright axis that no weight turns."""
+    J = np.zeros((6, 2))
+    J[:, 0], J[:, 1] = [0.0, 0.0, -0.5, 0.0, 1.0, 0.0], [0.2, 0.0, 0.0, 0.0, 0.0, 1.0]
+    np.testing.assert_allclose(carried(J, 2.0, np.array([0.1, 0.3])), [2.0 * 9.81 * 0.6 + 0.1, 0.3])
+
+
+def test_rounding_of_speeds_is_never_taken_for_a_torque():
+    """An oracle of its own: speeds of a joint that nothing pushes, rounded as a drive does, for a minute."""
+    rng, A, step, dt = np.random.default_rng(3), np.array([[1.4]]), 0.0049, 1e-3
+    bound = rounding(A, np.array([step / np.sqrt(12.0)]), np.array([0.01]))
+    r, d, before, largest = np.zeros(1), np.zeros(1), np.zeros(1), 0.0
+    qd, tau = 0.0, 0.0
+    for k in range(60_000):
+        if k % 500 == 0:
+            tau = float(rng.uniform(-2.0, 2.0)) - 0.5 * qd
+        qd += dt * tau / A[0, 0]
+        seen = np.array([np.round(qd / step) * step])
+        r = observed(r, A, seen, before, np.zeros(1), np.array([tau]), dt)
+        d, before = slow_part(d, r, np.array([9.0]), dt), seen
+        largest = max(largest, abs(d[0]))
+    assert 0.0 < largest < 0.5 * bound[0]
+    assert not beyond(d, bound)
+    assert beyond(d + 2.0 * bound, bound)
+    assert LASTING < BANDWIDTH
+
+
+def test_an_arm_that_has_come_to_rest_at_its_goal_does_not_go_on_pushing():
+    assert not settled(False, True, 0.5)
+    assert settled(False, True, 0.3)
+    assert settled(True, False, 0.5)
+    assert not settled(True, True, 0.8)
+    assert not settled(False, False, 0.0)
