@@ -110,7 +110,6 @@ HOT = np.dtype(
             ("settled", _INT),  # and stays as it is: the arm is at rest where it shall be
             ("qd_measured", _REAL, _JOINT),  # [rad/s] of the last feedback
             ("external_moving", _REAL, _JOINT),  # [Nm] as slow, hardly following where an encoder stands still
-            ("struck", _INT),  # the joint before the link that something ran into, -1 none
         ],
     )
 )

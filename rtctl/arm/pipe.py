@@ -122,7 +122,6 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         blocker=-1,
         nearest=np.inf,
         speed_scale=START_SPEED_SCALE,
-        struck=-1,
     )
 
 
