@@ -37,6 +37,7 @@ from rtctl.log.read.fields import FIELDS
 from rtctl.log.read.info import info
 from rtctl.log.read.run import read_run
 from rtctl.log.record import meshes
+from rtctl.rover.record import base_dtype
 from tests.arms import panda
 from tests.lab import PANDA, ROOT, recorded, robot
 from tools import crash, golden
@@ -224,7 +225,8 @@ def test_meshes_of_urdf_and_config_travel_with_the_log(tmp_path: Path):
 
 
 def test_every_field_of_a_tick_has_a_unit_and_a_meaning():
-    assert set(FIELDS) == set(record_dtype(7, 64).names or ())
+    arm, base = record_dtype(7, 64).names or (), base_dtype(8).names or ()
+    assert set(FIELDS) == {*arm, *base}
 
 
 def test_several_fields_in_one_pass_are_what_each_is_alone(log: Path):

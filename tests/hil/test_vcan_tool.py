@@ -80,7 +80,9 @@ def test_nothing_outlives_a_caller_that_is_killed() -> None:
 
 
 def test_where_it_cannot_run_it_names_the_command_that_helps() -> None:
-    script = "from tools import vcan; vcan._af_can = lambda: False; print(vcan.available().reason)"
+    script = (
+        "from tools import vcan; vcan._af_can = vcan._state_too_large = lambda: False; print(vcan.available().reason)"
+    )
     env = {"PATH": "/nonexistent", "PYTHONPATH": str(ROOT)}
     code = f"import tools.vcan; tools.vcan.SBIN = '/nonexistent'; {script}"
     told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
