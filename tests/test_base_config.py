@@ -133,7 +133,7 @@ def test_the_shipped_files_pass_and_check_tells_what_follows_from_them(capsys, t
         rows = {row["name"]: row for row in report["rows"]}
         assert rows["signing"]["verdict"] == "warn"
         assert rows["way to rest"]["value"] == pytest.approx(2.0 * 0.83 + 4.0 / 3.0)
-        assert rows["gap that is passed"]["value"] == pytest.approx(2.0 * (0.5 + 0.6 + 0.35 / 2**0.5))
+        assert rows["gap that is passed"]["value"] == pytest.approx(2.0 * (0.5 + 0.6 + 0.35 / 2**0.5) + 0.35)
     assert cli.main(["run", str(ROVER), "--lockstep"]) == 2
     assert "rtctl sim" in capsys.readouterr().err
     bad = tmp_path / "bad.toml"
