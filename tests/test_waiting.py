@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
@@ -169,7 +169,7 @@ def test_a_verb_that_does_not_come_to_its_end_says_why(
 
 
 @pytest.fixture
-def queue() -> Iterator[GoalQueue]:
+def queue() -> GoalQueue:
     queue = GoalQueue()
     assert queue.passed(Request(goal=GOAL), State.ARMED) == (Request(), QUEUED)
     assert queue.status()["queued"]
