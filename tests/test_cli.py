@@ -290,7 +290,7 @@ def test_hold_orientation_asks_for_the_present_one(arm: Arm) -> None:
     ids=lambda value: "" if isinstance(value, list) else names(value),
 )
 def test_a_goal_constrains_what_was_typed(arm: Arm, words: list[str], task: Task) -> None:
-    assert main(["goal", "0.1", "0.2", "0.3", *words, "--wait"]) == EXIT_OK
+    assert main(["goal", "0.1", "0.2", "0.3", *words, "--wait", "--reply", "60"]) == EXIT_OK
     goal = arm.requests[0].goal
     assert goal is not None
     assert goal.task == task

@@ -21,6 +21,7 @@ from rtctl.hal.messages import Bounds
 from rtctl.types import Goal, ObstacleEdit, Request, State, Task, Verb
 
 BOUNDS = Bounds((0.0, 0.0, 0.0), 1.0, 0.003, 0.015)
+PATIENT = ("--reply", "60")  # [s]: a busy machine may take its time
 Said = pytest.CaptureFixture[str]
 GOAL = Goal(np.array([0.1, 0.2, 0.3]), np.array([1.0, 0.0, 0.0, 0.0]), Task.POSITION, 0.003, 0.015)
 
@@ -80,7 +81,7 @@ def until(true: Callable[[], bool]) -> None:
 def test_a_daemon_that_starts_says_what_it_does_and_refuses_the_rest(place: str, capsys: Said) -> None:
     with Lobby(place, "toy") as lobby:
         lobby.tell("compiling", 12, 120)
-        assert main(["status"]) == EXIT_OK
+        assert main(["status", *PATIENT]) == EXIT_OK
         assert "compiling, 12 of at most 120" in capsys.readouterr().out
         with Session(place) as session:
             reply = session.ask({"verb": "stop"})
@@ -93,7 +94,7 @@ def test_a_daemon_that_starts_says_what_it_does_and_refuses_the_rest(place: str,
 def test_arming_waits_for_a_daemon_that_starts_and_finds_the_one_that_takes_over(place: str, capsys: Said) -> None:
     codes: list[int] = []
     with Lobby(place, "toy") as lobby:
-        arming = threading.Thread(target=lambda: codes.append(main(["arm"])))
+        arming = threading.Thread(target=lambda: codes.append(main(["arm", *PATIENT])))
         arming.start()
         lobby.tell("greeting the drives")
         with Session(place) as asking:
@@ -109,7 +110,7 @@ def test_arming_waits_for_a_daemon_that_starts_and_finds_the_one_that_takes_over
 def test_a_daemon_that_ends_while_it_starts_is_told_of(place: str, capsys: Said) -> None:
     codes: list[int] = []
     with Lobby(place, "toy"):
-        arming = threading.Thread(target=lambda: codes.append(main(["arm"])))
+        arming = threading.Thread(target=lambda: codes.append(main(["arm", *PATIENT])))
         arming.start()
         time.sleep(0.3)
     arming.join(60.0)
@@ -121,7 +122,7 @@ def test_watching_goes_on_when_a_living_daemon_hangs_up(place: str) -> None:
     from rtctl.cli.operate import _Asker
 
     with ExitStack() as stack, Toy(place, lambda request: "") as toy:
-        asker = stack.enter_context(closing(_Asker(place, 2.0)))
+        asker = stack.enter_context(closing(_Asker(place, 60.0)))
         assert asker.ask()["state"] == "IDLE"
         for peer in list(toy.console._peers.values()):  # as it does to make room for another
             with suppress(KeyError):
@@ -138,7 +139,7 @@ def test_watching_goes_on_when_a_living_daemon_hangs_up(place: str) -> None:
 def test_one_reset_is_enough_when_drives_must_clear_their_faults_first(place: str, capsys: Said) -> None:
     words = iter(["reset: drive faults are being cleared now: reset again"] * 2)
     with Toy(place, lambda request: next(words, "") if request.verb == Verb.RESET else "") as toy:
-        assert main(["reset"]) == EXIT_OK
+        assert main(["reset", *PATIENT]) == EXIT_OK
         assert toy.verbs == [Verb.RESET] * 3
     assert capsys.readouterr().out == "reset: IDLE\n"
 
@@ -161,7 +162,7 @@ def test_a_verb_that_does_not_come_to_its_end_says_why(
 ) -> None:
     with Toy(place, lambda request: "") as toy:
         toy.told |= told
-        assert main([word, "--timeout", "0.2"]) == EXIT_FAILED
+        assert main([word, "--timeout", "0.2", *PATIENT]) == EXIT_FAILED
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"rtctl: {said}")
 
 
