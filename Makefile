@@ -5,6 +5,8 @@
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
+# make fuzz    every decoder against bytes that others choose: nine minutes
+# make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -14,9 +16,10 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
+WORKERS ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress mutants install lock clean
+.PHONY: demo demo-rover test lint bench stress mutants fuzz ordeal install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -25,7 +28,7 @@ demo-rover: install
 	$(BIN)/python -m tools.demo_rover
 
 test: install lint
-	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST_FLAGS)
 
 lint: install
 	$(BIN)/ruff check
@@ -41,6 +44,12 @@ stress: install
 
 mutants: install
 	$(BIN)/python -m tools.mutants
+
+fuzz: install
+	$(BIN)/python -m tools.fuzz
+
+ordeal: install
+	$(BIN)/python -m tools.ordeal
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 
