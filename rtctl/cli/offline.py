@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+from rtctl.cli import page
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_OK, RtctlError, UsageError
 from rtctl.plain import Json
@@ -50,6 +51,12 @@ def add_after(commands: Commands) -> None:
     sim.add_argument("--json", action="store_true", help="print one JSON object")
     sim.add_argument("--log", metavar="FILE", default="", help="write an MCAP log")
     sim.add_argument("--realtime", action="store_true", help="no faster than the clock")
+    sim.add_argument(
+        "--view",
+        action="store_true",
+        help="show it in the browser, in real time; it takes commands, and goes on after its end",
+    )
+    page.add_address(sim)
     schema = command(
         commands, "schema", "print a JSON Schema, for editors", "rtctl schema config > configs/schema.json", _schema
     )
@@ -108,7 +115,8 @@ def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.spec.scenario import load_scenario, robot_file
 
     _prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
-    result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
+    with page.viewer(arguments) as shown:
+        result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime, shown=shown)
     if arguments.json:
         print(json.dumps(result))
     else:
