@@ -418,30 +418,15 @@ def test_a_live_source_follows_the_ring_and_says_when_it_ends(tmp_path: Path) ->
 def test_the_page_in_a_browser_shows_and_commands(tmp_path: Path) -> None:
     ring, row = ring_of(tmp_path)
     live = Live(ring=ring.path)
-    with daemon(tmp_path) as (path, got), browser.Browser(browser.DRAWS) as chrome:
+    with daemon(tmp_path) as (path, got):
         page, ended = Page(live, Operator(lambda: path), "127.0.0.1", 0), threading.Event()
         thread = threading.Thread(target=page.run, args=(ended.is_set,))
         thread.start()
         try:
             ring.put(1, row.tobytes(), 1)
-            chrome.resize(500, 500)
-            chrome.go(page.gate.url)
-            chrome.wait("document.body.innerText.includes('Torque, share')")
-            text = chrome.run("return document.body.innerText")
-            assert "RUN" in text
-            assert "Not an emergency stop" in text
-            press = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() == '{}')"
-            chrome.run(f"{press.format('Stop')}.click()")
-            chrome.wait("document.body.innerText.includes('stop: accepted')")
-            assert not chrome.run(f"return {press.format('Arm')}")
-            chrome.run(
-                "document.querySelector('input[type=checkbox]:not([id^=mantine])').click()"
-            )  # viser's own have such ids
-            chrome.wait(press.format("Arm"))
-            chrome.run(f"{press.format('Arm')}.click()")
-            chrome.wait("document.body.innerText.includes('arm: accepted')")
+            with browser.Browser(browser.DRAWS) as chrome:
+                used(chrome, page.gate.url)
             assert [request.verb for request in got] == [Verb.STOP, Verb.ARM]
-            chrome.go("about:blank")
             until = time.monotonic() + 60.0
             while page.operator.unlocked and time.monotonic() < until:  # nobody looks any more: it locks itself
                 time.sleep(0.05)
@@ -450,6 +435,24 @@ def test_the_page_in_a_browser_shows_and_commands(tmp_path: Path) -> None:
             ended.set()
             thread.join()
             page.close()
+
+
+def used(chrome: browser.Browser, url: str) -> None:
+    """Stop, unlock and arm as a person would, and read what the page says."""
+    chrome.resize(500, 500)
+    chrome.go(url)
+    chrome.wait("document.body.innerText.includes('Torque, share')")
+    text = chrome.run("return document.body.innerText")
+    assert "RUN" in text
+    assert "Not an emergency stop" in text
+    press = "[...document.querySelectorAll('button')].find(b => b.innerText.trim() == '{}')"
+    chrome.run(f"{press.format('Stop')}.click()")
+    chrome.wait("document.body.innerText.includes('stop: accepted')")
+    assert not chrome.run(f"return {press.format('Arm')}")
+    chrome.run("document.querySelector('input[type=checkbox]:not([id^=mantine])').click()")  # those are viser's own
+    chrome.wait(press.format("Arm"))
+    chrome.run(f"{press.format('Arm')}.click()")
+    chrome.wait("document.body.innerText.includes('arm: accepted')")
 
 
 def test_a_page_without_viewers_sends_nothing(record: Recorded) -> None:
