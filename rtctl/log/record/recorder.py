@@ -77,7 +77,6 @@ class Recorder:
         segment_bytes: int = 1 << 30,
         floor_bytes: int = 256 << 20,
         folders: Sequence[Path] = (),
-        timeout: float = READY_TIMEOUT,
         config: Path | None = None,
     ) -> "Recorder":
         """Create the ring, start the recorder and wait until it has opened its file.
@@ -93,7 +92,7 @@ class Recorder:
         ring = create(f"{PREFIX}{options.stem}-{os.getpid()}{SUFFIX}", capacity, blob, folders)
         recorder = cls(ring, options)
         recorder.spawn()
-        until = time.monotonic() + timeout
+        until = time.monotonic() + READY_TIMEOUT
         while not ring.counts().ready:
             if not recorder.alive or time.monotonic() > until:
                 recorder._abandon()
