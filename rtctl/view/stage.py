@@ -70,9 +70,16 @@ class Stage:
         scene, big = self.scene, self.scale
         scene.set_up_direction("+z")
         scene.add_grid(
-            "/floor", 4.0 * big, 4.0 * big, cell_size=0.1 * big, section_size=0.5 * big, plane_opacity=0.0,
-            cell_color=(226, 228, 232), section_color=(198, 202, 210), position=(0.0, 0.0, -0.002),
-        )  # fmt: skip
+            "/floor",
+            4.0 * big,
+            4.0 * big,
+            cell_size=0.1 * big,
+            section_size=0.5 * big,
+            plane_opacity=0.0,
+            cell_color=(226, 228, 232),
+            section_color=(198, 202, 210),
+            position=(0.0, 0.0, -0.002),
+        )
         base = self.body.base[:3, 3] if self.body is not None else np.zeros(3)
         server.initial_camera.position = base + np.array([1.7, -1.5, 1.25]) * (1.0 if big == 1.0 else 6.0)
         server.initial_camera.look_at = base + np.array([0.25, 0.0, 0.35]) * (1.0 if big == 1.0 else 0.0)
@@ -162,17 +169,29 @@ class Stage:
         if body is not None:
             is_plane = thing.shape.get("type") == "plane"
             self.scene.add_mesh_simple(
-                f"/obstacles/{name}/body", body.vertices, body.faces, color=colour, opacity=0.25 if is_plane else 0.75,
-                side="double", flat_shading=thing.shape.get("type") in ("box", "plane", "mesh", "cloud"),
+                f"/obstacles/{name}/body",
+                body.vertices,
+                body.faces,
+                color=colour,
+                opacity=0.25 if is_plane else 0.75,
+                side="double",
+                flat_shading=thing.shape.get("type") in ("box", "plane", "mesh", "cloud"),
                 cast_shadow=not is_plane,
-            )  # fmt: skip
+            )
         self.scene.add_label(f"/obstacles/{name}/label", name, font_screen_scale=0.85)
         shown = None
         if shell is not None:
             shown = self.scene.add_mesh_simple(
-                f"/obstacles/{name}/influence", shell.vertices, shell.faces, color=SHELL, opacity=0.16, side="double",
-                cast_shadow=False, receive_shadow=False, visible=self.shown.influence,
-            )  # fmt: skip
+                f"/obstacles/{name}/influence",
+                shell.vertices,
+                shell.faces,
+                color=SHELL,
+                opacity=0.16,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                visible=self.shown.influence,
+            )
         return _Thing(thing.shape, frame, shown)
 
     def _forces(self, m: Moment) -> None:
@@ -257,9 +276,13 @@ class Handles:
             return
         axes = (True, True, not self._is_base)
         handle = self._scene.add_transform_controls(
-            f"/handles/{name}", 0.9 if self._is_base else 0.16, active_axes=axes, disable_rotations=True,
-            depth_test=False, position=place,
-        )  # fmt: skip
+            f"/handles/{name}",
+            0.9 if self._is_base else 0.16,
+            active_axes=axes,
+            disable_rotations=True,
+            depth_test=False,
+            position=place,
+        )
 
         @handle.on_update
         def _(event: viser.TransformControlsEvent) -> None:
