@@ -7,6 +7,7 @@
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
 # make fuzz    every decoder against bytes that others choose: nine minutes
 # make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
+# make soak    a rover for a day of its own time: rate, memory and queues; some hours
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -19,7 +20,7 @@ PYTEST_FLAGS ?=
 WORKERS ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress mutants fuzz ordeal install lock clean
+.PHONY: demo demo-rover test lint bench stress mutants fuzz ordeal soak install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -50,6 +51,9 @@ fuzz: install
 
 ordeal: install
 	$(BIN)/python -m tools.ordeal
+
+soak: install
+	$(BIN)/python -m tools.soak --minutes 1440
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 

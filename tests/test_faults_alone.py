@@ -378,7 +378,7 @@ def test_an_observed_obstacle_may_creep_at_a_tenth_of_a_metre_in_a_second():
 
 
 def test_a_description_without_a_drives_fault_is_that_of_the_table():
-    nothing = Feedback(0, 0, *[np.zeros(2)] * 4, np.ones(2, int), np.array([0xE, 1]), 0, 0.0, 0.0)
+    nothing = feedback([0xE, 1])
     for name in ("contact", "overspeed"):
         assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP) == TABLE.describe(BIT[name], State.SAFE_STOP)
         assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP).startswith(f"SAFE_STOP: {name}: ")
