@@ -36,7 +36,7 @@ bench: install
 	$(BIN)/python -m tools.bench
 
 stress: install
-	$(BIN)/python -m tools.stress
+	$(BIN)/python -m rtctl campaign run tools.stress.source --count 500 --out out/stress
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 
@@ -58,7 +58,7 @@ $(WARM): $(shell find rtctl -name '*.py') | $(INSTALLED)
 
 lock: $(INSTALLED)
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \
-		--strip-extras --allow-unsafe --extra test --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		--strip-extras --allow-unsafe --extra test --extra campaign --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		--output-file requirements.lock pyproject.toml
 
 clean:

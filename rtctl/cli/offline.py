@@ -82,7 +82,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     passing = frozenset(_stranger(name) for name in arguments.pass_lock_of)
-    _prepare(arguments.config)
+    prepare(arguments.config)
     from rtctl.app.daemon import run
 
     return run(
@@ -107,7 +107,7 @@ def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.app.sim import simulate
     from rtctl.spec.scenario import load_scenario, robot_file
 
-    _prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
+    prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
     result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
     if arguments.json:
         print(json.dumps(result))
@@ -125,11 +125,11 @@ def _warm(arguments: argparse.Namespace) -> int:
     if not Path(config).is_file():
         raise UsageError(f"warm: {config}: no such file, wanted a config")
     vehicle_of(Path(config)).load(Path(config), None)
-    _prepare(config, strict=True)
+    prepare(config, strict=True)
     return EXIT_OK
 
 
-def _prepare(config: str, strict: bool = False) -> None:
+def prepare(config: str, strict: bool = False) -> None:
     """Compile what a config's robot needs where that was not done yet, and say so: it takes a while.
 
     What goes wrong then is left to the command itself to find and to tell, unless strict.
