@@ -43,6 +43,14 @@ class JointSetting(NamedTuple):
     zero: float  # [rad]
 
 
+class Tool(NamedTuple):
+    """What is fixed to the tip, in its frame."""
+
+    mass: float  # [kg]
+    com: tuple[float, ...]  # (3,) [m]
+    inertia: tuple[float, ...]  # (6,) [kg m^2] xx, xy, xz, yy, yz, zz about the centre
+
+
 class Settings(NamedTuple):
     """The robot file, as far as drives, plant and bus need it."""
 
@@ -51,6 +59,7 @@ class Settings(NamedTuple):
     urdf: Path
     package_dirs: tuple[Path, ...]
     tip_frame: str
+    tool: Tool
     base_position: tuple[float, float, float]
     base_wxyz: tuple[float, float, float, float]
     joints: tuple[JointSetting, ...]
@@ -138,6 +147,7 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
         urdf=resolve(robot["urdf"], path.parent, packages),
         package_dirs=packages,
         tip_frame=robot["tip_frame"],
+        tool=_tool(file.get("tool") or {"mass_kg": 0.0}),
         base_position=tuple(map(float, base.get("position_m", (0.0, 0.0, 0.0)))),  # type: ignore[arg-type]
         base_wxyz=quaternion(base),
         joints=tuple(
@@ -163,6 +173,11 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
         meshes=tuple(file.get("mesh", ())),
         socket=file.get("console", {}).get("socket"),
     )
+
+
+def _tool(table: dict[str, Any]) -> Tool:
+    com, inertia = table.get("com_m", (0.0,) * 3), table.get("inertia_kg_m2") or (0.0,) * 6
+    return Tool(float(table["mass_kg"]), tuple(map(float, com)), tuple(map(float, inertia)))
 
 
 def _rating(joint: dict[str, Any], scales: dict[str, codec.Scale], common: dict[str, Any]) -> Rating:

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_sim.reality import Reality
-from firmware_sim.settings import Settings, SettingsError, resolve
+from firmware_sim.settings import Settings, SettingsError, Tool, resolve
 
 STOP = 0.1  # [rad or m] mechanical stop outside the permitted range
 WORLD = "plant_world"
-PAYLOAD = "plant_payload"
+PAYLOAD, TOOL = "plant_payload", "plant_tool"
 PAYLOAD_RADIUS = 0.03  # [m] of the ball that a payload is
 MASSLESS = '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
 
@@ -94,7 +94,9 @@ def _make_wrong(root: ET.Element, reality: Reality) -> None:
 
 
 def _load(root: ET.Element, reality: Reality, settings: Settings) -> None:
-    """Fix the payload to its link: a ball of PAYLOAD_RADIUS that nothing can touch."""
+    """Fix the tool to the tip and the payload, a ball of PAYLOAD_RADIUS, to its link; nothing can touch either."""
+    if settings.tool.mass > 0.0:
+        _fix(root, TOOL, settings.tip_frame, settings.tool)
     m = reality.payload_kg
     if m == 0.0:
         return
@@ -102,16 +104,22 @@ def _load(root: ET.Element, reality: Reality, settings: Settings) -> None:
     if link not in {one.get("name") for one in root.iter("link")}:
         raise SettingsError(f"plant.payload_link: {link} is no link of {settings.urdf}")
     i = 0.4 * m * PAYLOAD_RADIUS**2
+    _fix(root, PAYLOAD, link, Tool(m, reality.payload_com, (i, 0.0, 0.0, i, 0.0, i)))
+
+
+def _fix(root: ET.Element, name: str, link: str, body: Tool) -> None:
+    """Fix a body without a shape to a link."""
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    inertia = " ".join(f'{k}="{v!r}"' for k, v in zip(keys, body.inertia, strict=True))
     root.append(
         ET.fromstring(
-            f'<link name="{PAYLOAD}"><inertial><mass value="{m!r}"/>'
-            f'<inertia ixx="{i!r}" ixy="0" ixz="0" iyy="{i!r}" iyz="0" izz="{i!r}"/></inertial></link>'
+            f'<link name="{name}"><inertial><mass value="{body.mass!r}"/><inertia {inertia}/></inertial></link>'
         )
     )
-    at = " ".join(map(repr, reality.payload_com))
+    at = " ".join(map(repr, body.com))
     root.append(
         ET.fromstring(
-            f'<joint name="{PAYLOAD}_joint" type="fixed"><parent link="{link}"/><child link="{PAYLOAD}"/>'
+            f'<joint name="{name}_joint" type="fixed"><parent link="{link}"/><child link="{name}"/>'
             f'<origin xyz="{at}" rpy="0 0 0"/></joint>'
         )
     )

@@ -42,6 +42,18 @@ class Model(NamedTuple):
     own_row: F64  # (L, n) d own_rho/d q
 
 
+class Load(NamedTuple):
+    """What is fixed to the tip's link beside what the URDF says, in the tip's frame."""
+
+    mass: float  # [kg]
+    com: F64  # (3,) [m]
+    inertia: F64  # (3, 3) [kg m2] about the centre
+
+
+UNLOADED = (0.0, 0.0, 0.0, 0.0)  # a payload: mass [kg] and centre [m] in the tip's frame
+NOTHING = Load(0.0, np.zeros(3), np.zeros((3, 3)))
+
+
 class JointLimits(NamedTuple):
     """Limits that the URDF states, in the order of the joint names."""
 
@@ -287,6 +299,9 @@ class RigidBody:
             tip_R=np.ascontiguousarray(frame.placement.rotation),
             tip_t=np.ascontiguousarray(frame.placement.translation),
         )
+        self._tip_joint, self._tip_pose = int(frame.parentJoint), pin.SE3(frame.placement)
+        self._bare = pin.Inertia(model.inertias[self._tip_joint])  # of the tip's link
+        self._payload = (0.0, 0.0, 0.0, 0.0)
         data = self.data
         self._terms = Terms(data.M, data.nle, data.g, data.J, data.dJ, *_held(data.oMi))
 
@@ -312,12 +327,13 @@ class RigidBody:
         base_pose: F64,
         armature: F64 | None = None,
         package_dirs: Sequence[str | Path] = (),
+        tool: Load = NOTHING,
     ) -> "RigidBody":
         """Read an arm from a URDF; joints that are not named are locked at zero.
 
         joint_names: order of every (n,) array. base_pose: (4, 4) X_WB, pose of the URDF's root in the world.
         armature: (n,) [kg m2] reflected rotor inertia added to A's diagonal, None is zero. package_dirs: what
-        package:// in mesh names resolves against. Raises ConfigError.
+        package:// in mesh names resolves against. tool: on the tip's link beside the URDF. Raises ConfigError.
         """
         place = str(urdf)
         if not Path(urdf).is_file():
@@ -333,6 +349,9 @@ class RigidBody:
         locked = [j for j in range(1, full.njoints) if full.names[j] not in joint_names]
         model, geometry = pin.buildReducedModel(full, geometry, locked, pin.neutral(full))
         _move_base(model, geometry, base_pose)
+        if tool.mass > 0.0:
+            frame = model.frames[model.getFrameId(tip_frame)]
+            model.inertias[frame.parentJoint] += frame.placement.act(pin.Inertia(tool.mass, tool.com, tool.inertia))
         body = cls(model, geometry, joint_names, tip_frame)
         if armature is not None:
             inertia = np.zeros(model.nv)
@@ -356,11 +375,25 @@ class RigidBody:
         full[self._iv] = qd
         return full
 
-    def evaluate(self, q: F64, qd: F64, points: Points, own: Own | None = None) -> Model:
+    def carry(self, payload: Sequence[float]) -> None:
+        """Let the tip's link carry a payload: mass [kg] and its centre x, y, z [m] in the tip's frame, a point."""
+        wanted = (float(payload[0]), float(payload[1]), float(payload[2]), float(payload[3]))
+        if wanted == self._payload:
+            return
+        self._payload = wanted
+        point = pin.Inertia(wanted[0], np.array(wanted[1:]), np.zeros((3, 3)))
+        self.model.inertias[self._tip_joint] = (
+            self._bare + self._tip_pose.act(point) if wanted[0] > 0.0 else pin.Inertia(self._bare)
+        )
+
+    def evaluate(
+        self, q: F64, qd: F64, points: Points, own: Own | None = None, payload: Sequence[float] = UNLOADED
+    ) -> Model:
         """Return every term of the law at one state: A(q) qdd + h(q, qd) + g(q) = tau, and J, Jdqd, PSPs.
 
-        q, qd: (n,) [rad, rad/s]. The result shares no memory with this object.
+        q, qd: (n,) [rad, rad/s]; payload: as of `carry`. The result shares no memory with this object.
         """
+        self.carry(payload)
         pin.computeAllTerms(self.model, self.data, self.configuration(q), self._velocity(qd))
         found = _assemble(self._terms, self.skeleton, qd, points.link, points.local)
         terms, (Rj, tj) = found[:12], found[12:]

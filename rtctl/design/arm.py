@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.arm.disturbance import GRAVITY
 from rtctl.arm.encoders import SHARE
 from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
 from rtctl.arm.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
 from rtctl.arm.law import prepared
-from rtctl.arm.model import RigidBody
+from rtctl.arm.model import NOTHING, Load, Model, RigidBody
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
 from rtctl.arm.robot import Robot, StopParams
@@ -41,10 +42,13 @@ P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
 class Extremes(NamedTuple):
     """Largest values over sampled postures within the joint limits, and those at home."""
 
-    gravity: F64  # (n,) [Nm] largest |g_i|
+    gravity: F64  # (n,) [Nm] largest |g_i|, that of the tool included
     gravity_home: F64  # (n,) [Nm] |g_i|
     inertia: F64  # (n,) [kg m2] largest A_ii
     inertia_home: F64  # (n,) [kg m2] A_ii
+    tool: F64  # (n,) [Nm] largest torque of the tool's weight
+    payload: F64  # (n,) [Nm] largest |g_i| with payload_max_kg at the tip
+    payload_home: F64  # (n,) [Nm] the same at home
 
 
 def build(config: Config, path: str | Path) -> Robot:
@@ -127,7 +131,26 @@ def extremes(config: Config, body: RigidBody) -> Extremes:
     models = [body.evaluate(q, still, points) for q in (np.array(config.robot.home_rad), *samples)]
     g = np.abs([m.g for m in models])
     A = np.array([np.diag(m.A) for m in models])
-    return Extremes(g.max(axis=0), g[0], A.max(axis=0), A[0])
+    tool, payload = tool_of(config), config.robot.payload_max_kg
+    tools = np.array([weight(m, tool.mass, tool.com) for m in models])
+    loaded = np.array([np.abs(m.g + weight(m, payload, np.zeros(3))) for m in models])
+    return Extremes(g.max(axis=0), g[0], A.max(axis=0), A[0], np.abs(tools).max(axis=0), loaded.max(axis=0), loaded[0])
+
+
+def weight(model: Model, mass: float, com: F64) -> F64:
+    """Return the torque (n,) [Nm] that carries a mass [kg] whose centre is at com (3,) [m] in the tip's frame."""
+    arm = model.R @ com
+    lifts = model.J[2] + model.J[3] * arm[1] - model.J[4] * arm[0]  # of the centre, along the world's z
+    return np.asarray(GRAVITY * mass * lifts)
+
+
+def tool_of(config: Config) -> Load:
+    """Return the tool of a config."""
+    tool = config.tool
+    if tool is None:
+        return NOTHING
+    xx, xy, xz, yy, yz, zz = tool.inertia_kg_m2 or (0.0,) * 6
+    return Load(tool.mass_kg, np.array(tool.com_m), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
 
 
 def rigid_body(config: Config, path: Path) -> RigidBody:
@@ -139,7 +162,8 @@ def rigid_body(config: Config, path: Path) -> RigidBody:
     names = [j.name for j in config.robot.joints]
     armature = np.array([j.armature_kg_m2 for j in config.robot.joints])
     try:
-        return RigidBody.from_urdf(urdf, names, config.robot.tip_frame, X, armature, package_folders(urdf))
+        tip, tool = config.robot.tip_frame, tool_of(config)
+        return RigidBody.from_urdf(urdf, names, tip, X, armature, package_folders(urdf), tool)
     except ConfigError as error:
         what = error.place.rpartition(": ")[2]
         if what == "joint" and error.got in names:
@@ -176,9 +200,23 @@ def _refuse_limits(config: Config, body: RigidBody, source: str) -> None:
 
 
 def _refuse_torque(config: Config, found: Extremes, source: str) -> None:
-    """Refuse a joint that cannot hold the arm at home with what may be sent, or anywhere with its rating."""
+    """Refuse a joint that cannot hold the arm at home with what may be sent, or anywhere with its rating.
+
+    What is named is the tool where the arm without it could be held, and the largest payload where it cannot at home.
+    """
     for i, j in enumerate(config.robot.joints):
         usable = config.safety.torque_ratio * j.tau_max_Nm
+        if config.tool is not None and found.tool[i] > 0.0:
+            for place, most, torque in (
+                ("at home", usable, found.gravity_home[i]),
+                ("", j.tau_max_Nm, found.gravity[i]),
+            ):
+                if torque >= most > torque - found.tool[i]:
+                    wanted = f"less: {j.name} would carry {torque:.3g} of {most:.3g} Nm {place or 'within the limits'}"
+                    raise ConfigError(name_place(source, "tool.mass_kg"), config.tool.mass_kg, wanted)
+        if found.payload_home[i] >= usable > found.gravity_home[i]:
+            wanted = f"less: {j.name} would carry {found.payload_home[i]:.3g} of {usable:.3g} Nm at home"
+            raise ConfigError(name_place(source, "robot.payload_max_kg"), config.robot.payload_max_kg, wanted)
         place = name_place(source, f"robot.joints[{i}].tau_max_Nm")
         if found.gravity_home[i] >= usable:
             wanted = f"more than gravity's {found.gravity_home[i]:.3g} Nm at home / torque_ratio"

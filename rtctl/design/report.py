@@ -159,6 +159,14 @@ def _torque(r: Robot, found: Extremes) -> list[Row]:
         ratio = found.gravity[i] / r.tau_max[i]
         note = f"{found.gravity[i]:.3g} of {r.tau_max[i]:.4g} Nm, at home {found.gravity_home[i]:.3g}"
         rows.append(_row(f"gravity at {joint}", 100 * ratio, "%", note, bool(ratio < 0.9)))
+    for i, joint in enumerate(r.joints if found.tool.any() else ()):
+        note = f"at most {found.tool[i]:.3g} of the {found.gravity[i]:.3g} Nm above"
+        rows.append(_row(f"of it the tool at {joint}", 100 * found.tool[i] / r.tau_max[i], "%", note))
+    if r.payload_max > 0.0:
+        ratio = found.payload / r.tau_max
+        i = int(ratio.argmax())
+        note = f"{found.payload[i]:.3g} of {r.tau_max[i]:.4g} Nm at {r.joints[i]}, {r.payload_max:g} kg at the tip"
+        rows.append(_row("gravity with payload_max_kg", 100 * ratio[i], "%", note, bool(ratio[i] < 1.0)))
     return rows
 
 

@@ -14,6 +14,7 @@ Text = Annotated[str, Meta(min_length=1, max_length=255)]
 Key = Annotated[str, Meta(min_length=1, max_length=64)]  # a name inside the URDF
 Angle = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Angles = Annotated[tuple[Angle, ...], Meta(min_length=1, max_length=15)]
+Moment = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Rate = Annotated[float, Meta(ge=10.0, le=4000.0)]
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 Milliseconds = Annotated[float, Meta(ge=0.1, le=1000.0)]
@@ -50,6 +51,24 @@ class BasePose(Table, frozen=True, kw_only=True):
     position_m: Place = (0.0, 0.0, 0.0)
     rpy_rad: RollPitchYaw | None = None
     wxyz: Orientation | None = None
+
+
+class ToolTable(Table, frozen=True, kw_only=True):
+    """What is fixed to the tip's link and is not in the URDF, in the frame `robot.tip_frame`."""
+
+    mass_kg: Annotated[float, Meta(ge=0.0, le=200.0)]
+    com_m: Annotated[tuple[Length, Length, Length], Meta(description="centre of mass, in the tip's frame")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    inertia_kg_m2: (
+        Annotated[
+            tuple[Moment, Moment, Moment, Moment, Moment, Moment],
+            Meta(description="xx, xy, xz, yy, yz, zz about the centre, along the tip's axes; nothing: a point"),
+        ]
+        | None
+    ) = None
 
 
 class RobotTable(Table, frozen=True, kw_only=True):
@@ -254,6 +273,7 @@ class Config(Table, frozen=True, kw_only=True):
     avoid: Avoid
     safety: Safety
     log: LogTable
+    tool: ToolTable | None = None
     estimator: Estimator = Estimator()
     console: ConsoleTable = ConsoleTable()
     drives: Annotated[dict[Name, DriveTable], Meta(max_length=64)] = {}

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from rtctl.control.firas import eta_of, rho_num_of
 from rtctl.errors import ConfigError
 from rtctl.protocol import e2e, mit
@@ -23,7 +25,7 @@ class Found(NamedTuple):
 
 def refuse(config: Config, source: str) -> None:
     """Raise ConfigError for the first contradiction between the keys of `config`."""
-    for group in (_available, _names, _drives, _rates, _distances, _slots, _postures, _link):
+    for group in (_available, _names, _drives, _tool, _rates, _distances, _slots, _postures, _link):
         for found in group(config):
             raise ConfigError(name_place(source, found.path), found.got, found.wanted)
     refuse_obstacles(config.obstacle, source)
@@ -115,6 +117,16 @@ def _drives(c: Config) -> Iterator[Found]:
             if abs(p) > scale.p_max:
                 reads = f"; the drive reads {p:g} there" if p != q else ""
                 yield Found(at + key, q, f"within p_max = +-{scale.p_max:g} {of}{reads}")
+
+
+def _tool(c: Config) -> Iterator[Found]:
+    if c.tool is None or c.tool.inertia_kg_m2 is None:
+        return
+    xx, xy, xz, yy, yz, zz = c.tool.inertia_kg_m2
+    least, middle, largest = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
+    if least < 0.0 or largest > (least + middle) * (1.0 + 1e-6) + 1e-12:
+        got = f"principal moments {least:.3g}, {middle:.3g}, {largest:.3g}"
+        yield Found("tool.inertia_kg_m2", got, "none negative, none more than the other two together: no body has them")
 
 
 def _rates(c: Config) -> Iterator[Found]:
