@@ -16,6 +16,7 @@ from scipy.stats import binomtest
 
 from rtctl.campaign import rates
 from rtctl.campaign.case import Case, Scene
+from rtctl.campaign.case import code as code_of
 from rtctl.campaign.minimise import ddmin, minimised
 from rtctl.campaign.robots import grid, text_of
 from rtctl.campaign.store import Store
@@ -72,6 +73,8 @@ def test_a_killed_client_loses_nothing_and_nothing_is_played_twice(tmp_path: Pat
     with (out / "journal.jsonl").open("a") as journal:
         journal.write('{"key": "half a li')  # as far as the killed one came
     (marks / "go").touch()
+    about = out / "campaign.json"  # the sources may change while a test runs
+    about.write_text(json.dumps(json.loads(about.read_text()) | {"code": code_of()}))
     assert main(words) == 0
     assert set(rows(out)) == set(range(8))
     assert plays(marks) == {**dict.fromkeys(range(8), 1), 5: 2}  # the one it died in has no row before
