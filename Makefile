@@ -4,6 +4,7 @@
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
+# make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -37,6 +38,9 @@ bench: install
 
 stress: install
 	$(BIN)/python -m rtctl campaign run tools.stress.source --count 500 --out out/stress
+
+benchmark: install
+	$(BIN)/python -m tools.benchmark --data "$(DATA)" $(BENCHMARK_FLAGS)
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 

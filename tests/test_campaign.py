@@ -29,7 +29,7 @@ SOURCE = "tests.campaign_source:source"
 
 def command(folder: Path, marks: Path, *more: str) -> list[str]:
     marks.mkdir(exist_ok=True)
-    return ["campaign", "run", SOURCE, "--count", "8", "--out", str(folder), "--option", f"marks={marks}", *more]
+    return ["campaign", "run", SOURCE, "--count", "6", "--out", str(folder), "--option", f"marks={marks}", *more]
 
 
 def rows(folder: Path) -> dict[int, dict[str, Any]]:
@@ -54,11 +54,11 @@ def test_two_workers_of_which_one_is_killed_give_what_one_process_gives(tmp_path
     assert main(command(there, tmp_path / "b", "--workers", "2", "--option", "kill=3")) == 0
     one, two = rows(here), rows(there)
     assert (tmp_path / "b" / "killed").exists()
-    assert set(one) == set(two) == set(range(8))
-    assert [one[k]["digest"] for k in range(8)] == [two[k]["digest"] for k in range(8)]
-    assert all(one[k]["digest"] for k in range(8))
+    assert set(one) == set(two) == set(range(6))
+    assert [one[k]["digest"] for k in range(6)] == [two[k]["digest"] for k in range(6)]
+    assert all(one[k]["digest"] for k in range(6))
     assert len({row["worker"] for row in two.values()}) >= 2
-    assert plays(tmp_path / "a") == dict.fromkeys(range(8), 1)
+    assert plays(tmp_path / "a") == dict.fromkeys(range(6), 1)
 
 
 def test_a_killed_client_loses_nothing_and_nothing_is_played_twice(tmp_path: Path):
@@ -76,10 +76,10 @@ def test_a_killed_client_loses_nothing_and_nothing_is_played_twice(tmp_path: Pat
     about = out / "campaign.json"  # the sources may change while a test runs
     about.write_text(json.dumps(json.loads(about.read_text()) | {"code": code_of()}))
     assert main(words) == 0
-    assert set(rows(out)) == set(range(8))
-    assert plays(marks) == {**dict.fromkeys(range(8), 1), 5: 2}  # the one it died in has no row before
+    assert set(rows(out)) == set(range(6))
+    assert plays(marks) == {**dict.fromkeys(range(6), 1), 5: 2}  # the one it died in has no row before
     assert main(words) == 0
-    assert plays(marks) == {**dict.fromkeys(range(8), 1), 5: 2}
+    assert plays(marks) == {**dict.fromkeys(range(6), 1), 5: 2}
 
 
 def test_a_folder_takes_one_campaign_of_one_code_and_one_client(tmp_path: Path):
