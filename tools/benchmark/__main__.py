@@ -27,8 +27,8 @@ PUBLISHED = (
     ),
 )
 ABOUT = """
-What others have published of problems of the same archive, on their machines. They plan alone: geometry and joint goals,
-no moving arm; the times are of planning."""
+What others have published of problems of the same archive, on their machines. They plan alone: geometry and joint
+goals, no moving arm; the times are of planning."""
 
 
 def published() -> str:

@@ -1,7 +1,8 @@
 """MotionBenchMaker's problems as a source of `rtctl campaign`; docs/benchmark.md says where the data come from.
 
 A goal is the pose that the tip has at the problem's goal joints. What the arm is to grasp there stands among the
-obstacles: what is nearer than GRASPED to it at the goal is left out. Arrived within NEAR and TURNED, without a contact, counts.
+obstacles: what is nearer than GRASPED to it at the goal is left out. Arrived within NEAR and
+TURNED, without a contact, counts.
 """
 
 import gzip
