@@ -5,6 +5,7 @@
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
 # make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
+# make mutants small changes of what decides about torque, each of which a test must notice: about an hour
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench benchmark stress install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -41,6 +42,9 @@ stress: install
 
 benchmark: install
 	$(BIN)/python -m tools.benchmark --data "$(DATA)" $(BENCHMARK_FLAGS)
+
+mutants: install
+	$(BIN)/python -m tools.mutants
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 
