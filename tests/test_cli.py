@@ -32,6 +32,9 @@ ROOT = Path(__file__).parent.parent
 Said = pytest.CaptureFixture[str]
 
 
+COMES_TO = {Verb.ARM: "RUN", Verb.RECOVER: "RUN", Verb.DISARM: "IDLE", Verb.STOP: "SAFE_STOP", Verb.RESET: "IDLE"}
+
+
 class Arm:
     """A daemon of few words: takes goals, reaches those with y >= 0 after a few looks, refuses to arm twice."""
 
@@ -66,6 +69,9 @@ class Arm:
             "log": {"path": "logs/x.mcap", "dropped": 0},
         }
 
+    def _refusal(self, verb: Verb) -> str:
+        return "arm: is in RUN, wanted IDLE" if verb == Verb.ARM and self.state == "RUN" else ""
+
     def _run(self) -> None:
         slot = 0
         while not self.over.is_set():
@@ -75,8 +81,8 @@ class Arm:
             if request.goal is not None:
                 self.goal, self.looks = request.goal.position, 0
                 self.state = "FAULT" if self.goal[2] < 0.0 else "RUN"
-            refused = "arm: is in RUN, wanted IDLE" if request.verb == Verb.ARM else ""
-            self.console.answer(not refused, refused)
+            self.console.answer(not self._refusal(request.verb), self._refusal(request.verb))
+            self.state = self.state if self._refusal(request.verb) else COMES_TO.get(request.verb, self.state)
             slot += 1
             self.over.wait(0.0005)
 
@@ -213,7 +219,9 @@ def test_an_interrupt_is_quiet(arm: Arm) -> None:
     while not arm.looks:  # it waits for a goal that is never reached
         arm.over.wait(0.01)
     process.send_signal(signal.SIGINT)
-    assert process.communicate() == (b"", b"")
+    out, err = process.communicate()
+    assert out == b""
+    assert b"Traceback" not in err
     assert process.returncode == EXIT_FAILED
 
 
@@ -226,11 +234,19 @@ def test_the_version_is_that_of_the_package() -> None:
 # -- operator's verbs -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("word", ["disarm", "stop", "reset", "recover"])
-def test_a_verb_reaches_the_daemon_and_says_so(arm: Arm, word: str, capsys: Said) -> None:
+@pytest.mark.parametrize(
+    ("word", "end"),
+    [("disarm", "IDLE"), ("stop", "SAFE_STOP, at rest; rtctl reset leaves it"), ("reset", "IDLE"), ("recover", "RUN")],
+)
+def test_a_verb_reaches_the_daemon_and_says_what_it_came_to(arm: Arm, word: str, end: str, capsys: Said) -> None:
     assert main([word]) == EXIT_OK
     assert [request.verb.name for request in arm.requests] == [word.upper()]
-    assert capsys.readouterr().out == f"{word}: accepted\n"
+    assert capsys.readouterr().out == f"{word}: {end}\n"
+
+
+def test_a_verb_that_is_not_to_wait_says_that_it_was_taken(arm: Arm, capsys: Said) -> None:
+    assert main(["stop", "--no-wait"]) == EXIT_OK
+    assert capsys.readouterr().out == "stop: accepted\n"
 
 
 def test_a_refusal_is_exit_code_1_with_the_supervisors_reason(arm: Arm, capsys: Said) -> None:
@@ -239,7 +255,8 @@ def test_a_refusal_is_exit_code_1_with_the_supervisors_reason(arm: Arm, capsys: 
 
 
 def test_a_goal_reaches_the_tick_as_it_was_typed(arm: Arm) -> None:
-    assert main(["goal", "-.3", "-1e-3", "5e-1", "--wxyz", "0", "1", "0", "0", "--tolerance", "0.01"]) == EXIT_OK
+    words = ["-.3", "-1e-3", "5e-1", "--wxyz", "0", "1", "0", "0", "--tolerance", "0.01", "--no-wait"]
+    assert main(["goal", *words]) == EXIT_OK
     goal = arm.requests[0].goal
     assert goal is not None
     assert goal.position.tolist() == [-0.3, -0.001, 0.5]
@@ -273,7 +290,7 @@ def test_hold_orientation_asks_for_the_present_one(arm: Arm) -> None:
     ids=lambda value: "" if isinstance(value, list) else names(value),
 )
 def test_a_goal_constrains_what_was_typed(arm: Arm, words: list[str], task: Task) -> None:
-    assert main(["goal", "0.1", "0.2", "0.3", *words, "--wait"]) == EXIT_OK
+    assert main(["goal", "0.1", "0.2", "0.3", *words, "--wait", "--reply", "60"]) == EXIT_OK
     goal = arm.requests[0].goal
     assert goal is not None
     assert goal.task == task

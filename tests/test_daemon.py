@@ -1,6 +1,7 @@
 """`rtctl run` as a process beside its drives: how it starts, what it refuses, and how it ends whatever happens."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,8 +24,8 @@ STOP_DISTANCE = 0.5**2 / (2 * 5.0)  # [m] from v_max at a_max, both of configs/p
 
 
 def one_line(process: Process) -> str:
-    """All that a process said, which must be one line and no traceback."""
-    text = process.text.strip()
+    """All that a process said after whose daemon starts, which must be one line and no traceback."""
+    text = re.sub(r"^rtctl: starting .*\n", "", process.text).strip()
     assert "\n" not in text, text
     assert "Traceback" not in text
     return text
@@ -76,6 +77,12 @@ class TestSession:
         for verb in ("arm", "disarm", "stop", "recover"):
             assert idle.ask(verb)["error"] == f"{verb}: not possible in state SAFE_STOP"
         assert "not possible in state SAFE_STOP" in idle.ask("goal", position_m=AWAY)["error"]
+
+    def test_a_goal_told_while_it_arms_is_taken_when_it_runs(self, idle: Rig) -> None:
+        assert idle.ask("arm")["ok"]
+        assert idle.ask("goal", position_m=AWAY)["ok"]
+        until(lambda: idle.status()["goal_m"] == AWAY, lambda: f"not taken: {idle.status()}")
+        assert not idle.status()["queued"]
 
     def test_the_status_tells_of_the_arm_and_the_program_while_it_runs(self, idle: Rig) -> None:
         idle.arm()
@@ -292,7 +299,7 @@ def test_without_drives_it_says_so_in_one_line(tmp_path: Path) -> None:
     with Rig(tmp_path) as rig:
         alone = rig.launch()
         assert alone.wait() == EXIT_FAILED
-        assert one_line(alone) == f"rtctl: {tmp_path}/bus: nothing serves this bus (No such file or directory)"
+        assert one_line(alone).startswith(f"rtctl: {tmp_path}/bus: nothing serves this bus (No such file or directory)")
 
 
 def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:

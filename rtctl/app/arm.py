@@ -61,6 +61,7 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
         return ArmPlay(robot, scenario, simulator, ArmLink(link_spec(config), InProcess.of(simulator)))
 
     return Setup(
+        name=config.robot.name,
         loop=config.loop,
         console=config.console,
         log=config.log,

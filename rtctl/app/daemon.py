@@ -15,13 +15,15 @@ from typing import Generic, NamedTuple
 import numpy as np
 
 from rtctl.app.choose import vehicle_of
+from rtctl.app.queue import GoalQueue
 from rtctl.app.servo import Servo
-from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, C, F, Loop, M, R, Setup, Vehicle
+from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, C, F, Loop, M, R, Say, Setup, Vehicle
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 from rtctl.hal import clock
 from rtctl.hal.client import default_path
 from rtctl.hal.clock import Slot
 from rtctl.hal.console import Console
+from rtctl.hal.lobby import Lobby
 from rtctl.hal.service import InstanceLock, Service
 from rtctl.log.header import Header
 from rtctl.log.record.recorder import Recorder
@@ -31,6 +33,7 @@ from rtctl.types import Link, State, Verb
 from rtctl.world.primitives import MESH
 
 REVIEW = 0.5  # [s] between looks at the recorder
+REST = 0.1  # [s] at rest before a status says so
 
 
 class Signals:
@@ -65,6 +68,7 @@ def run(
     dry: bool = False,
     timeout: float | None = None,
     passing: Collection[int] = (),
+    lobby: Lobby | None = None,
 ) -> int:
     """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
 
@@ -72,33 +76,48 @@ def run(
     dry: everything is computed and logged, but only stop frames are sent.
     timeout: [s] that the vehicle is waited for, in place of what the config says.
     passing: user ids whose hold on the bus does not count, see `InstanceLock`.
+    lobby: who answers at the control socket already; by default that begins here.
     """
     path = Path(config_path)
     vehicle = vehicle_of(path)
     if lockstep and not vehicle.keeps_step:
         raise UsageError("--lockstep is for drives on a bus; `rtctl sim` plays a base in lockstep")
-    return _run(vehicle, vehicle.load(path, timeout), lockstep, dry, passing)
+    return _run(vehicle, vehicle.load(path, timeout), How(lockstep, dry, passing, lobby))
 
 
-def _run(
-    vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], lockstep: bool, dry: bool, passing: Collection[int]
-) -> int:
-    signals = Signals()
+class How(NamedTuple):
+    """How a daemon was asked to run: the arguments of `run`."""
+
+    lockstep: bool
+    dry: bool
+    passing: Collection[int]
+    lobby: Lobby | None
+
+
+def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> int:
+    signals, lockstep, dry = Signals(), how.lockstep, how.dry
     with ExitStack() as stack:
-        stack.enter_context(InstanceLock(*setup.resource, ignore=passing))
+        stack.enter_context(InstanceLock(*setup.resource, ignore=how.passing))
+        place = setup.console.socket or default_path(setup.name)
+        lobby = how.lobby
+        if lobby is None or lobby.path != place:
+            lobby = stack.enter_context(Lobby(place, setup.name))
+        lobby.tell("building the robot and loading what is compiled")
         robot = setup.build()
         vehicle.warm(robot)
         link = stack.enter_context(closing(setup.open()))
-        place = setup.console.socket or default_path(robot.name)
-        console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link))))
-        say(f"rtctl: {robot.name} on {setup.place}, console {console.path}")
-        start = link.greet(lockstep, lambda text: say(f"rtctl: {text}"), lambda: signals.count > 0)
+        say(f"rtctl: {robot.name} on {setup.place}, console {place}")
+        lobby.tell("greeting the drives" if vehicle.keeps_step else "waiting for the autopilot")
+        start = link.greet(lockstep, _teller(lobby), lambda: signals.count > 0)
         header = setup.header(robot, start, link)
         told = {**header.extra, **surroundings(setup.loop.realtime, link.counters, dry)}
+        listener = lobby.hand_over()  # before the recorder: it is a process of its own
+        console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link), listener=listener)))
         recorder = _recorder(setup.log, header._replace(extra=told))
         servo = Servo(vehicle, robot, link, recorder, start, dry)
+        queue = GoalQueue()
         console.publish(
-            lambda: status(servo, recorder),
+            lambda: {**status(servo, recorder), **queue.status()},
             lambda: world(servo),
             lambda edit: vehicle.misplaced(robot, servo.memory, edit),
         )
@@ -108,7 +127,7 @@ def _run(
         service.ready(f"{robot.name}: IDLE")
         say(f"rtctl: ready, log {recorder.stats().path}")
         link.settle()
-        process = Process(servo, console, service, recorder, signals, lockstep)
+        process = Process(servo, console, service, recorder, signals, queue, lockstep)
         code, failure = EXIT_FAILED, None
         slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
         try:
@@ -123,6 +142,14 @@ def _run(
         say("".join(traceback.format_exception(failure)).rstrip(), to=2)
     say(_summary(servo, stats.path, stats.dropped))
     return code
+
+
+def _teller(lobby: Lobby) -> Say:
+    def told(text: str) -> None:
+        say(f"rtctl: {text}")
+        lobby.tell(text)
+
+    return told
 
 
 def _scheduled(loop: Loop, sleeps: str) -> None:
@@ -167,12 +194,13 @@ class Process(NamedTuple, Generic[R, M, F, C]):
     service: Service
     recorder: Recorder
     signals: Signals
+    queue: GoalQueue
     lockstep: bool
 
 
 def _loop(process: Process[R, M, F, C], slots: Iterator[Slot]) -> int:
     """Turn until the supervisor says that the daemon may leave; return the exit code."""
-    servo, console, service, recorder, signals, lockstep = process
+    servo, console, service, recorder, signals, queue, lockstep = process
     every = max(1, round(REVIEW / servo.robot.dt))
     told, heard = 0, True
     for slot in slots:
@@ -180,8 +208,10 @@ def _loop(process: Process[R, M, F, C], slots: Iterator[Slot]) -> int:
         if signals.take():
             request = request._replace(verb=Verb.TERM)
             service.stopping()
+        request, put_aside = queue.passed(request, servo.memory.state)
         servo.turn(slot, request)
-        console.answer(not servo.memory.refusal, servo.memory.refusal)
+        queue.judged(servo.memory.refusal)
+        console.answer(not servo.memory.refusal, servo.memory.refusal or put_aside)
         recorder.beat(time.monotonic_ns())
         service.kick(slot.slot)
         for now, name, detail in servo.events[told:]:
@@ -222,6 +252,7 @@ def status(servo: Servo[R, M, F, C], recorder: Recorder) -> Json:
         "tick": m.tick,
         "time_s": servo.now,
         **servo.vehicle.status(robot, m, servo.link, servo.events),
+        "at_rest": m.rest * robot.dt >= REST,
         "missed": servo.missed,
         "lateness_s": servo.lateness,
         "compute_s": servo.compute,

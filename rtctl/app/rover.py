@@ -40,6 +40,7 @@ def load(path: Path, timeout: float | None = None) -> Setup[Base, BaseMemory, Ba
     if timeout is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, handshake_s=timeout))
     return Setup(
+        name=config.robot.name,
         loop=config.loop,
         console=config.console,
         log=config.log,

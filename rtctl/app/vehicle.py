@@ -62,6 +62,8 @@ class Remembered(Protocol):
     @property
     def refusal(self) -> str: ...  # why this tick's request was refused, '' when it was not
     @property
+    def rest(self) -> int: ...  # ticks at rest
+    @property
     def done(self) -> bool: ...  # nothing more to do: the daemon may leave
     @property
     def world(self) -> World: ...
@@ -132,6 +134,7 @@ class Loop(Protocol):
 class Setup(NamedTuple, Generic[R, M, F, C]):
     """One robot file, read and checked."""
 
+    name: str  # of the robot
     loop: Loop
     console: ConsoleTable
     log: LogTable

@@ -12,7 +12,16 @@ from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 EXAMPLES = """example:
   rtctl check configs/panda.toml
   rtctl run configs/panda.toml &
-  rtctl arm && rtctl goal 0.45 0.20 0.40 --wait && rtctl status
+  rtctl arm && rtctl goal 0.45 0.20 0.40 && rtctl status
+"""
+CODES = """
+exit codes of all commands (each command's own: rtctl COMMAND --help):
+  0   done; a verb: what it causes has happened
+  1   it failed: refused, not reached, touched, no daemon, a log that cannot be read
+  2   a wrong call: an unknown command or option, a value of the wrong kind
+  78  a file, or what was found on the bus, is refused
+
+Not safety-rated: a hardware emergency stop is required.
 """
 
 
@@ -21,7 +30,7 @@ def build_parser() -> Parser:
     parser = Parser(
         prog="rtctl",
         description="Torque control of arms in operational space, with obstacle avoidance, over CAN.",
-        epilog=EXAMPLES + "\nNot safety-rated: a hardware emergency stop is required.",
+        epilog=EXAMPLES + CODES,
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
@@ -56,14 +65,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what could come next (rtctl completion)
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    arguments = parser.parse_args(argv)
     if arguments.version:
         from rtctl import __version__
 
         print(f"rtctl {__version__}")
         return EXIT_OK
     if arguments.command is None:
-        raise UsageError("no command (see rtctl --help)")
+        raise UsageError("COMMAND: got nothing, wanted one, such as check, sim, run, arm (see rtctl --help)")
     return int(arguments.work(arguments))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from rtctl.cli.values import goal_messages
+from rtctl.cli.waiting import LEAVES, Notes
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError
 from rtctl.hal.client import Session, accepted
 from rtctl.plain import Json
@@ -16,6 +17,18 @@ POLL = 0.05  # [s] between two looks at the status
 ARRIVED = "arrived"
 PASSED = "passed"
 MOVING_STATES = ("ARMED", "RUN")
+FIRST = {"IDLE": "; rtctl arm comes first", "STOPPING": "; it comes to rest now", **LEAVES}
+WORDS = {  # what a status means, for one who waits no more
+    "moving": "it is still on its way",
+    "escaping": "it is still going round what blocks the way",
+    "shadowed": "the goal lies within the influence of an obstacle",
+    "local_minimum": "obstacles block the way: rtctl plan finds one around them",
+    "saturated": "the torque limits hold the arm",
+    "singular": "the arm cannot move that way from where it is",
+    "limited": "joint limits hold the arm",
+    "unreachable": "the goal is farther away than the arm is long",
+    "blind": "where it would go has not been seen",
+}
 
 
 class Outcome(NamedTuple):
@@ -53,7 +66,16 @@ class Outcome(NamedTuple):
 
 def send(session: Session, message: Json) -> Json:
     """Return the daemon's reply. Raises RequestError with its reason."""
-    return accepted(session.ask(message))
+    try:
+        return accepted(session.ask(message))
+    except RequestError as error:
+        raise RequestError(f"{error}{hint(str(error))}") from None
+
+
+def hint(refusal: str) -> str:
+    """Return what to do about a verb that a state does not allow, '' where nothing is known."""
+    _, _, state = refusal.partition("not possible in state ")
+    return FIRST.get(state, "")
 
 
 def send_and_wait(session: Session, message: Json, timeout: float) -> Outcome:
@@ -64,20 +86,27 @@ def send_and_wait(session: Session, message: Json, timeout: float) -> Outcome:
 
 def awaited(session: Session, message: Json, timeout: float, near: float = 0.0) -> Outcome:
     """Return what became of the goal of `message` within `timeout` [s]; one that is `near` [m] counts as passed."""
-    wanted, begin = message.get("position_m"), time.monotonic()
+    wanted, begin, notes = message.get("position_m"), time.monotonic(), Notes("goal")
     while True:
         status = accepted(session.ask({"verb": "status"}))  # made after the goal was taken: never of the one before
+        elapsed = time.monotonic() - begin
+        if status.get("queued") and elapsed <= timeout:  # the robot arms still
+            notes.say("waiting until the robot is armed; the goal is queued", "queued")
+            time.sleep(POLL)
+            continue
         if wanted is None:  # given in degrees: where that is
             wanted = status.get("goal_m") or [math.nan] * 3
         why = _end(status, wanted)
-        elapsed = time.monotonic() - begin
         if not why and near and wanted and _known(status.get("error_m")) <= near:
             why = PASSED
         if not why and elapsed > timeout:
-            why = f"{status.get('status', '?')} {status.get('detail') or ''} after {timeout:g} s".replace("  ", " ")
+            name = str(status.get("status", "?"))
+            detail = f" ({status['detail']})" if status.get("detail") else ""
+            why = f"{name}{detail} after {timeout:g} s: {WORDS.get(name, 'the time is over')}"
         if why:
             errors = [_known(status.get(key)) for key in ("error_m", "error_rad")]
             return Outcome(wanted, why in (ARRIVED, PASSED), why, elapsed, *errors)
+        notes.say(f"waiting until it is reached (at most {timeout:g} s; --no-wait does not wait)", "")
         time.sleep(POLL)
 
 
@@ -115,6 +144,8 @@ def _end(status: Json, wanted: list[float] | None) -> str:
     if state not in MOVING_STATES:
         faults = ", ".join(map(str, status.get("faults") or ()))
         return f"{state}{': ' + faults if faults else ''}"
+    if status.get("queue_refusal"):
+        return str(status["queue_refusal"])
     present = status.get("goal_m")
     if present is None or any(abs(a - b) > 1e-6 for a, b in zip(present, wanted or present, strict=True)):
         return "replaced by another goal"

@@ -2,14 +2,20 @@
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, command, positive
-from rtctl.errors import EXIT_OK, RtctlError, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 from rtctl.plain import Json
+
+if TYPE_CHECKING:
+    from rtctl.hal.lobby import Lobby
 
 
 def add_before(commands: Commands) -> None:
@@ -50,6 +56,9 @@ def add_after(commands: Commands) -> None:
     sim.add_argument("--json", action="store_true", help="print one JSON object")
     sim.add_argument("--log", metavar="FILE", default="", help="write an MCAP log")
     sim.add_argument("--realtime", action="store_true", help="no faster than the clock")
+    sim.add_argument(
+        "--allow-miss", action="store_true", help="exit 0 also when a goal was missed or something touched"
+    )
     schema = command(
         commands, "schema", "print a JSON Schema, for editors", "rtctl schema config > configs/schema.json", _schema
     )
@@ -67,6 +76,22 @@ def add_after(commands: Commands) -> None:
     bench = command(commands, "bench", "measure the speed figures on this machine", "rtctl bench", _bench)
     bench.add_argument("arguments", metavar="ARG", nargs="*", help="passed on to tools/bench.py, after --")
 
+    completion = command(
+        commands,
+        "completion",
+        "print what makes a shell complete rtctl's words",
+        "rtctl completion bash > ~/.local/share/bash-completion/completions/rtctl",
+        _completion,
+    )
+    completion.add_argument("shell", choices=("bash", "zsh", "fish"), metavar="SHELL", help="bash, zsh or fish")
+
+
+def _completion(arguments: argparse.Namespace) -> int:
+    from argcomplete.shell_integration import shellcode
+
+    print(shellcode(["rtctl"], shell=arguments.shell))
+    return EXIT_OK
+
 
 def _check(arguments: argparse.Namespace) -> int:
     from rtctl import design
@@ -82,12 +107,42 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     passing = frozenset(_stranger(name) for name in arguments.pass_lock_of)
-    _prepare(arguments.config)
-    from rtctl.app.daemon import run
+    with ExitStack() as stack:
+        lobby = _lobby(arguments.config)
+        if lobby is not None:
+            stack.enter_context(lobby)
+            print(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", file=sys.stderr, flush=True)
+        _prepare(arguments.config, lobby=lobby)
+        from rtctl.app.daemon import run
 
-    return run(
-        arguments.config, lockstep=arguments.lockstep, dry=arguments.dry, timeout=arguments.timeout, passing=passing
-    )
+        return run(
+            arguments.config,
+            lockstep=arguments.lockstep,
+            dry=arguments.dry,
+            timeout=arguments.timeout,
+            passing=passing,
+            lobby=lobby,
+        )
+
+
+def _lobby(config: str) -> "Lobby | None":
+    """Return who answers at the control socket from now on: what follows takes seconds to load, minutes to compile.
+
+    None where the file does not say plainly whose daemon it is, or the place is taken: the daemon itself tells then.
+    """
+    import tomllib
+
+    from rtctl.hal.client import default_path
+    from rtctl.hal.lobby import Lobby
+
+    try:
+        tables = tomllib.loads(Path(config).read_text(encoding="utf-8"))
+        name, socket = tables["robot"]["name"], tables.get("console", {}).get("socket", "")
+        if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,31}", name) and isinstance(socket, str):
+            return Lobby(socket or default_path(name), name)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, RtctlError):
+        pass
+    return None
 
 
 def _stranger(name: str) -> int:
@@ -115,7 +170,19 @@ def _sim(arguments: argparse.Namespace) -> int:
         from rtctl.cli.summary import show
 
         show(result, arguments.scenario, arguments.log)
+    missed = _missed(result)
+    if missed and not arguments.allow_miss:
+        print(f"rtctl: sim: {missed} (--allow-miss exits 0 all the same)", file=sys.stderr)
+        return EXIT_FAILED
     return EXIT_OK
+
+
+def _missed(result: Json) -> str:
+    """Return what a run failed in, in words, '' for nothing."""
+    goals = result.get("goals") or ()
+    missed, touched = sum(not goal["arrived"] for goal in goals), int(result.get("contacts") or 0)
+    why = [f"{missed} of {len(goals)} goals missed"] if missed else []
+    return ", ".join([*why, f"{touched} contacts"] if touched else why)
 
 
 def _warm(arguments: argparse.Namespace) -> int:
@@ -129,7 +196,7 @@ def _warm(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _prepare(config: str, strict: bool = False) -> None:
+def _prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> None:
     """Compile what a config's robot needs where that was not done yet, and say so: it takes a while.
 
     What goes wrong then is left to the command itself to find and to tell, unless strict.
@@ -146,9 +213,11 @@ def _prepare(config: str, strict: bool = False) -> None:
     def told(done: int) -> None:
         nonlocal printed
         draw(min(done, total))
+        if lobby is not None:
+            lobby.tell("compiling what is not compiled yet", done, total)
         if not sys.stderr.isatty() and time.monotonic() - printed > 5.0:
             printed = time.monotonic()
-            print(f"rtctl: compiled {done} of about {total} kernels", file=sys.stderr, flush=True)
+            print(f"rtctl: compiled {done} of at most {total} kernels", file=sys.stderr, flush=True)
 
     try:
         with bar("compiling", total) as draw:

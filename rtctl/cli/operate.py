@@ -2,9 +2,10 @@
 
 import argparse
 import json
-import math
+import os
 import sys
 import time
+from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, Parser, add_daemon, command, daemon_of, number, positive
@@ -39,7 +40,8 @@ KEYS_OF = {
     "cloud": "file=FILE.npy|.xyz|.ply point_radius_m [voxel_m]",
 }
 WATCH_PERIOD = 0.1  # [s]
-ARM_TIME = 60.0  # [s] after which `arm` is waited for no more
+NOTE_EVERY = 5.0  # [s] between two notes of a daemon that gives no answer
+PATIENT, PATIENCE = ("arm", "recover"), 3.0  # [s] verbs that a daemon started beside is waited for, to open its socket
 EVERYTHING = "*"
 MISSION_MAX = 4_000_000  # characters of a mission's file at most
 
@@ -48,10 +50,12 @@ def add(commands: Commands) -> None:
     """Add the operator's commands."""
     for verb, text in VERBS.items():
         parser = command(commands, verb, text, f"rtctl {verb} --robot panda", _verb)
-        if verb == "arm":
-            parser.add_argument("--no-wait", action="store_true", help="return when it was taken, not when it is done")
+        _add_no_wait(parser)
+        parser.add_argument(
+            "--timeout", metavar="S", type=positive, default=60.0, help="to come to that (%(default)s s)"
+        )
         add_daemon(parser)
-    example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0 --wait"
+    example = "rtctl goal 0.45 -0.2 0.4 --rpy 3.14 0 0"
     goal = command(commands, "goal", "send the tip to a position [m], a pose, or a part of one", example, _goal)
     for axis in "xyz":
         goal.add_argument(
@@ -68,7 +72,8 @@ def add(commands: Commands) -> None:
     goal.add_argument("--axes", metavar="AXES", help="of X Y Z those that count: xy, z, …; none: orientation alone")
     goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
     _add_waiting(goal)
-    goal.add_argument("--wait", action="store_true", help="return when the tip has arrived; exit code 1 if it does not")
+    _add_no_wait(goal)
+    goal.add_argument("--wait", action="store_true", help=argparse.SUPPRESS)  # what it does anyway, for older calls
     goals = command(commands, "goals", "send a stream of goals", "rtctl goals tour.csv --keep-going", _goals)
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
@@ -97,6 +102,10 @@ def add(commands: Commands) -> None:
     add_daemon(status)
 
 
+def _add_no_wait(parser: Parser) -> None:
+    parser.add_argument("--no-wait", action="store_true", help="return when it was taken, not when it is done")
+
+
 def _add_waiting(parser: Parser) -> None:
     parser.add_argument("--timeout", metavar="S", type=positive, default=30.0, help="to arrive, a goal (%(default)s s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object per goal")
@@ -115,7 +124,8 @@ def _add_obstacle(commands: Commands) -> None:
     example = "rtctl obstacle set crate box size_m=0.2,0.2,0.1 position_m=0.5,0,0.05"
     setter = command(actions, "set", "put an obstacle, or move it", example, _set)
     setter.add_argument("name", metavar="NAME")
-    setter.add_argument("type", metavar="TYPE", help="one of those above")
+    kind = setter.add_argument("type", metavar="TYPE", help="one of those above")
+    kind.completer = lambda **_: list(KEYS_OF)  # type: ignore[attr-defined] # as argcomplete looks for it
     setter.add_argument("keys", metavar="KEY=VALUE", nargs="*", help="as in a scenario's [[obstacle]]; lists by commas")
     setter.description = "Put an obstacle, or move it. Its type's own keys:\n\n" + "\n".join(
         f"  {kind:12} {keys}" for kind, keys in KEYS_OF.items()
@@ -144,13 +154,13 @@ def _said(reply: Json, default: str) -> int:
 
 
 def _verb(arguments: argparse.Namespace) -> int:
-    if arguments.command != "arm" or arguments.no_wait:
-        return _said(_demand(arguments, {"verb": arguments.command}), f"{arguments.command}: accepted")
-    from rtctl.hal.client import Session, accepted
+    from rtctl.cli.waiting import perform, ready_session, told
 
-    with Session(daemon_of(arguments), arguments.reply) as session:
-        accepted(session.ask({"verb": "arm"}))
-        return _armed(session)
+    verb = arguments.command
+    if arguments.no_wait:
+        return _said(_demand(arguments, {"verb": verb}), f"{verb}: accepted")
+    with ready_session(arguments, verb, PATIENCE if verb in PATIENT else 0.0) as session:
+        return told(verb, perform(session, verb, arguments.timeout))
 
 
 def _payload(arguments: argparse.Namespace) -> int:
@@ -159,25 +169,6 @@ def _payload(arguments: argparse.Namespace) -> int:
     message: Json = {"verb": "payload", "mass_kg": arguments.mass}
     message |= {"com_m": arguments.com} if arguments.com else {}
     return _said(_demand(arguments, message), f"payload: {arguments.mass:g} kg")
-
-
-def _armed(session: "Session") -> int:
-    """Wait until the robot runs; print why it does not, in the vehicle's own words where it has any."""
-    from rtctl.hal.client import accepted
-
-    begun, since = time.monotonic(), math.nan
-    while True:
-        status = accepted(session.ask({"verb": "status"}))
-        since = float(status.get("time_s", 0.0)) if math.isnan(since) else since
-        if status.get("state") == "RUN":
-            print("arm: RUN")
-            return EXIT_OK
-        if status.get("state") != "ARMED" or time.monotonic() - begun > ARM_TIME:
-            words = [text for at, text in status.get("vehicle", {}).get("words", ()) if at >= since - WATCH_PERIOD]
-            why = "; ".join([*words, *(() if words else status.get("faults") or ("without a reason",))])
-            print(f"rtctl: arm: {status.get('state')}: {why}", file=sys.stderr)
-            return EXIT_FAILED
-        time.sleep(WATCH_PERIOD)
 
 
 def _set(arguments: argparse.Namespace) -> int:
@@ -221,9 +212,9 @@ def _clear(arguments: argparse.Namespace) -> int:
 
 
 def _goal(arguments: argparse.Namespace) -> int:
-    from rtctl.cli.goals import Outcome, send, send_and_wait
+    from rtctl.cli.goals import Outcome, send_and_wait
     from rtctl.cli.values import letters
-    from rtctl.hal.client import Session
+    from rtctl.cli.waiting import ready_session
 
     message: Json = {"verb": "goal", **_place(arguments)}
     if arguments.axes == "none":
@@ -241,9 +232,9 @@ def _goal(arguments: argparse.Namespace) -> int:
     message |= {key: value for key, value in asked.items() if value is not None}
     if arguments.hold_orientation:
         message["hold"] = "orientation"
-    with Session(daemon_of(arguments), arguments.reply) as session:
-        if not arguments.wait:
-            return _said(send(session, message), "goal: accepted")
+    if arguments.no_wait:
+        return _said(_demand(arguments, message), "goal: accepted")
+    with ready_session(arguments, "goal") as session:
         outcome: Outcome = send_and_wait(session, message, arguments.timeout)
     outcome.show(arguments.json)
     return EXIT_OK if outcome.arrived else EXIT_FAILED
@@ -263,9 +254,11 @@ def _place(arguments: argparse.Namespace) -> Json:
 def _goals(arguments: argparse.Namespace) -> int:
     from rtctl.cli import missions
     from rtctl.cli.goals import run_stream
-    from rtctl.hal.client import Session
+    from rtctl.cli.waiting import ready_session
 
-    with Session(daemon_of(arguments), arguments.reply) as session:
+    if arguments.file != "-" and not os.path.isfile(arguments.file):
+        raise UsageError(f"{arguments.file}: got no such file, wanted one of goals, or - for standard input")
+    with ready_session(arguments, "goals") as session:
         if arguments.file == "-":
             return run_stream(session, sys.stdin, "stdin", arguments)
         with open(arguments.file, encoding="utf-8", errors="replace") as lines:
@@ -277,28 +270,51 @@ def _goals(arguments: argparse.Namespace) -> int:
 
 
 def _status(arguments: argparse.Namespace) -> int:
-    from rtctl.hal.client import Session, accepted
-
-    with Session(daemon_of(arguments), arguments.reply) as session:
-
-        def ask() -> Json:
-            return accepted(session.ask({"verb": "status"}))
-
+    with closing(_Asker(daemon_of(arguments), arguments.reply)) as asker:
         if arguments.json:
             while True:
-                print(json.dumps(ask()), flush=True)
+                print(json.dumps(asker.ask()), flush=True)
                 if not arguments.watch:
                     return EXIT_OK
                 time.sleep(WATCH_PERIOD)
         from rtctl.cli import view
 
         if not arguments.watch:
-            view.show(ask())
+            view.show(asker.ask())
             return EXIT_OK
-        try:
-            view.watch(ask, WATCH_PERIOD)
-        except KeyboardInterrupt:  # the way one leaves it
-            return EXIT_OK
-        except LinkError as error:
-            raise LinkError(f"the daemon has ended: {error}") from None
+        with suppress(KeyboardInterrupt):  # the way one leaves it
+            view.watch(asker.ask, WATCH_PERIOD)
     return EXIT_OK
+
+
+class _Asker:
+    """Asks for the status again and again: of a daemon that is busy or has hung up on us too."""
+
+    def __init__(self, path: str, timeout: float) -> None:
+        self.path, self.timeout = path, timeout
+        self._session: Session | None = None
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def ask(self) -> Json:
+        """Return the status. Raises LinkError only when no daemon is there any more."""
+        from rtctl.hal.client import Session, accepted, answers
+
+        met, told = self._session is not None, 0.0
+        while True:
+            try:
+                if self._session is None:
+                    self._session = Session(self.path, self.timeout)
+                return accepted(self._session.ask({"verb": "status"}))
+            except LinkError as error:
+                self.close()
+                if not answers(self.path):
+                    raise LinkError(f"{self.path}: the daemon has ended" if met else str(error)) from None
+                if "no answer" in str(error) and time.monotonic() - told > NOTE_EVERY:
+                    told = time.monotonic()
+                    print(f"rtctl: status: {error}: it is there and busy; asking again", file=sys.stderr, flush=True)
+                time.sleep(WATCH_PERIOD)

@@ -16,6 +16,7 @@ from rtctl.trust import folder_owner, peer, trusted_users, user_name
 
 MESSAGE_MAX = 64 * 1024  # bytes, both ways
 SYSTEM = Path("/run/rtctl")  # RuntimeDirectory of the shipped unit: root makes it, for the user of the unit
+LOOK = 0.1  # [s] between two looks for a daemon that starts
 RETRY = 0.005  # [s] between two attempts when the daemon's queue of callers is full
 
 
@@ -37,22 +38,36 @@ def default_path(robot: str) -> str:
     return str(folder / f"rtctl-{robot}.sock")
 
 
-def find(robot: str = "") -> str:
-    """Return the socket of `robot`, or of the only daemon there is.
+def find(robot: str = "", patience: float = 0.0) -> str:
+    """Return the socket of `robot`, or of the only daemon there is; wait `patience` [s] for one that starts.
 
     Raises LinkError when there is none, UsageError when it takes a name to choose.
     """
-    pattern = f"rtctl-{robot}.sock" if robot else "rtctl-*.sock"
+    until = time.monotonic() + patience
+    while True:
+        alive = running()
+        found = [path for path in alive if not robot or Path(path).name == f"rtctl-{robot}.sock"]
+        if len(found) == 1:
+            return found[0]
+        if len(found) > 1:
+            raise UsageError(f"got several daemons, wanted --robot NAME or --socket PATH of one: {', '.join(found)}")
+        if time.monotonic() >= until:
+            break
+        time.sleep(LOOK)
+    if alive:
+        names = ", ".join(Path(path).stem.removeprefix("rtctl-") for path in alive)
+        raise LinkError(f"--robot: got {robot}, of which no daemon is running, wanted one of {names}")
+    looked = ", ".join(str(folder) for folder in socket_folders())
+    whose = f"of {robot} " if robot else ""
+    raise LinkError(f"no daemon {whose}is running (rtctl run CONFIG starts one): none answers in {looked}")
+
+
+def running() -> list[str]:
+    """Return the sockets of all daemons that answer and may be believed."""
     places = [place for folder in socket_folders() for place in (folder, *_subfolders(folder))]
     mine = [place for place in places if _listens_to_us(place)]
-    found = sorted({str(path) for place in mine for path in place.glob(pattern) if path.is_socket()})
-    alive = [path for path in found if answers(path)]
-    if len(alive) == 1:
-        return alive[0]
-    if not alive:
-        looked = ", ".join(str(folder) for folder in socket_folders())
-        raise LinkError(f"no daemon {'of ' + robot + ' ' if robot else ''}is running: no {pattern} answers in {looked}")
-    raise UsageError(f"several daemons run: choose one by --socket PATH or --robot NAME: {', '.join(alive)}")
+    found = sorted({str(path) for place in mine for path in place.glob("rtctl-*.sock") if path.is_socket()})
+    return [path for path in found if answers(path)]
 
 
 def _listens_to_us(folder: Path) -> bool:

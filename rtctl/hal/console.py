@@ -10,7 +10,6 @@ import math
 import os
 import select
 import socket
-import stat
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -21,15 +20,14 @@ import msgspec
 import numpy as np
 
 from rtctl import trust
-from rtctl.errors import ConfigError, RequestError, RtctlError
+from rtctl.errors import RequestError, RtctlError
 from rtctl.hal import messages
-from rtctl.hal.client import MESSAGE_MAX, answers
+from rtctl.hal.client import MESSAGE_MAX
+from rtctl.hal.lobby import PEERS_MAX, listen
 from rtctl.hal.messages import Bounds, Notice
 from rtctl.plain import Json
-from rtctl.trust import TrustError
 from rtctl.types import Array, ObstacleEdit, Request
 
-PEERS_MAX = 8
 EDITS_PER_SLOT = 4  # obstacle edits handed to one tick; a longer camera frame is spread over several
 NOTICES_MAX = 64  # names that may wait for their slot
 BYTES_PER_SLOT = 8 * 1024  # of requests on average: a full message costs the next slots their turn
@@ -58,15 +56,23 @@ class _Held(NamedTuple):
 class Console:
     """The listening socket, its peers, and the requests between them and the tick."""
 
-    def __init__(self, path: str, period: float, bounds: Bounds, members: Iterable[int] = ()) -> None:
+    def __init__(
+        self,
+        path: str,
+        period: float,
+        bounds: Bounds,
+        members: Iterable[int] = (),
+        listener: socket.socket | None = None,
+    ) -> None:
         """Listen at `path`; serve this user, root and the user ids in `members`.
 
-        `period` [s] of a slot; goals must lie in `bounds`. Raises ConfigError when the place is unsafe or taken.
+        `period` [s] of a slot; goals must lie in `bounds`. listener: a socket that listens there already.
+        Raises ConfigError when the place is unsafe or taken.
         """
         self.path, self.counts = path, Counter[str]()
         self._period, self._bounds = period, bounds
         self._admitted = frozenset((0, os.geteuid(), *members))
-        self._listener = _listen(path)
+        self._listener = listener if listener is not None else listen(path)
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
         self._peers: dict[int, _Peer] = {}
@@ -288,38 +294,6 @@ class Console:
     def _send(link: socket.socket, reply: Json) -> None:
         with suppress(OSError):
             link.send(msgspec.json.encode(reply))
-
-
-def _listen(path: str) -> socket.socket:
-    """Return the listening socket, for its owner and group alone."""
-    _check_folder(path)
-    label = f"console.socket {path}"
-    if os.path.lexists(path):
-        if not stat.S_ISSOCK(os.lstat(path).st_mode):
-            raise ConfigError(label, "a file that is no socket", "a free path")
-        if answers(path):
-            raise ConfigError(label, "a socket on which another daemon listens", "a free path")
-        os.unlink(path)  # left behind by a daemon that was killed
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
-    try:
-        os.fchmod(listener.fileno(), 0o660)  # before it has a name, so that it is never open to others
-        listener.bind(path)
-        listener.listen(PEERS_MAX)
-    except OSError as error:
-        listener.close()
-        raise ConfigError(label, error.strerror or str(error), "a path a socket can be bound to") from None
-    return listener
-
-
-def _check_folder(path: str) -> None:
-    """Make the folder with mode 0750, or refuse one where strangers could replace the socket."""
-    folder, label = os.path.dirname(os.path.abspath(path)), f"console.socket {path}"
-    try:
-        trust.own_folder(folder)
-    except OSError as error:
-        raise ConfigError(label, f"folder {folder}: {error.strerror}", "a folder that exists or can be made") from None
-    except TrustError as error:
-        raise ConfigError(label, str(error), "a folder of this user or root that others cannot write to") from None
 
 
 def _plain(value: Array | np.generic) -> object:

@@ -154,7 +154,8 @@ class Seqpacket(_Socket):
             except OSError as error:
                 sock.close()
                 if error.errno not in (errno.ENOENT, errno.ECONNREFUSED, errno.EAGAIN) or time.monotonic() >= deadline:
-                    message = f"{self._path}: nothing serves this bus ({os.strerror(error.errno or 0)})"
+                    why = os.strerror(error.errno or 0)
+                    message = f"{self._path}: nothing serves this bus ({why}); python -m firmware_sim CONFIG does"
                     raise LinkError(message) from error
                 time.sleep(0.02)
             else:
