@@ -223,10 +223,10 @@ class Safety(Table, frozen=True, kw_only=True):
     ] = 0.05
     collision_ratio: Annotated[
         float, Meta(ge=0.002, le=1.0, description="of tau_max: an external torque that comes faster is a contact")
-    ] = 0.02
+    ] = 0.1
     collision_hard_ratio: Annotated[
         float, Meta(ge=0.01, le=2.0, description="the same, after which the arm is driven no more")
-    ] = 0.2
+    ] = 0.4
     speed_ratio: Annotated[float, Meta(ge=1.0, le=1.5, description="of qd_max, beyond it a fault")] = 1.2
     limit_excess_rad: Annotated[float, Meta(ge=0.0, le=0.2, description="beyond a joint limit, then a fault")] = 0.02
     obstacle_stale_s: Annotated[
