@@ -116,7 +116,8 @@ def _straight_gap(base: Base) -> list[Row]:
     if not len(base.cover):
         return []
     wide = float(np.ptp(base.points[:, 1]))
-    return [_row("gap straight on", wide + 2.0 * base.margins.aside + CELL, "m", "that the outline passes on a leg")]
+    gap = wide + 2.0 * base.margins.aside + 3.0 * CELL  # returns and outline lie in cells, and headings are HEADINGS
+    return [_row("gap straight on", gap, "m", "that the outline passes on a leg")]
 
 
 def _cover(c: BaseConfig) -> F64:
