@@ -84,9 +84,16 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("rejected", after.refusal))
     fresh = after.in_force & ~before.in_force
     if fresh:
-        found.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
+        found.append(
+            ("fault", faults.describe(fresh, feedback, robot.joints, after.state, robot.links[after.contact_link]))
+        )
     if after.state != before.state:
         found.append(("state", after.state.name))
+    if not np.array_equal(after.payload, before.payload):
+        mass, x, y, z = after.payload
+        found.append(("payload", f"{mass:g} kg at {x:g} {y:g} {z:g} m of the tip" if mass > 0.0 else "none"))
+    if before.floating and not after.floating:
+        found.append(("hold", "no hand guides the arm any more"))
     if (after.status, after.blockers) != (before.status, before.blockers) and after.status != Status.NO_GOAL:
         found.append((after.status.name.lower(), "; ".join(after.blocked_by)))
     return found
@@ -114,6 +121,8 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
         "error_m": error,
         "error_rad": error_rot,
         "clearance_m": clearances(m),
+        "payload": dict(zip(("mass_kg", "com_m"), (float(m.payload[0]), m.payload[1:]), strict=True)),
+        "untold_Nm": m.lasting if m.noticed else np.zeros(robot.n),
         "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
     }
 
