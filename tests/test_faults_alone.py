@@ -221,6 +221,8 @@ outside_limits    50  SS1 R
 overspeed         50  SS1 R
 innovation        21  SS1 R {MOTION} torque
 log_degraded      51  LOG A
+collision         24  SS2 R
+collision_hard    24  SS1 R
 """
 
 
