@@ -9,6 +9,7 @@
 # make fuzz    every decoder against bytes that others choose: nine minutes
 # make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
 # make soak    a rover for a day of its own time: rate, memory and queues; some hours
+# make docs    the site of documents, into out/site
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -21,7 +22,7 @@ PYTEST_FLAGS ?=
 WORKERS ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench benchmark stress mutants fuzz ordeal soak install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants docs fuzz ordeal soak install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -58,6 +59,9 @@ ordeal: install
 
 soak: install
 	$(BIN)/python -m tools.soak --minutes 1440
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 
