@@ -47,7 +47,7 @@ def test_a_hand_moves_the_arm_and_it_stays_where_it_was_let_go():
         here.run(0.4)
         before = here.simulator.plant.tip_pose()[0]
         tips = pulled(here, before + np.array([0.0, -0.02, 0.0]), 0.1)  # now it resists
-        assert np.linalg.norm(tips[-1] - before) < 5e-3
+        assert np.linalg.norm(tips[-1] - before) < 8e-3
 
 
 def test_a_virtual_wall_stops_the_hand_and_speed_is_bounded():
