@@ -4,7 +4,9 @@
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
+# make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
+# make docs    the site of documents, into out/site
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -16,7 +18,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress mutants install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants docs install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -37,10 +39,16 @@ bench: install
 	$(BIN)/python -m tools.bench
 
 stress: install
-	$(BIN)/python -m tools.stress
+	$(BIN)/python -m rtctl campaign run tools.stress.source --count 500 --out out/stress
+
+benchmark: install
+	$(BIN)/python -m tools.benchmark --data "$(DATA)" $(BENCHMARK_FLAGS)
 
 mutants: install
 	$(BIN)/python -m tools.mutants
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 
@@ -62,7 +70,7 @@ $(WARM): $(shell find rtctl -name '*.py') | $(INSTALLED)
 
 lock: $(INSTALLED)
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \
-		--strip-extras --allow-unsafe --extra test --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		--strip-extras --allow-unsafe --extra test --extra campaign --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		--output-file requirements.lock pyproject.toml
 
 clean:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -55,8 +56,10 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
     if timeout is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, handshake_s=timeout))
 
+    build = cache(lambda: cfg.build(config, path))  # takes seconds; a robot is constant
+
     def simulate(scenario: Scenario, source: Path) -> ArmPlay:
-        robot = scenario_robot(cfg.build(config, path), scenario, source)
+        robot = scenario_robot(build(), scenario, source)
         simulator = open_simulator(path, scenario, source)
         return ArmPlay(robot, scenario, simulator, ArmLink(link_spec(config), InProcess.of(simulator)))
 
@@ -67,7 +70,7 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
         log=config.log,
         resource=(bus_resource(config.link.interface, config.link.channel), "link.channel"),
         place=f"{config.link.interface}:{config.link.channel}",
-        build=lambda: cfg.build(config, path),
+        build=build,
         open=lambda: open_link(config, path),
         header=lambda robot, start, link: header_of(config, path, robot, start.q, counters=link.counters),
         simulate=simulate,
