@@ -7,8 +7,9 @@ from hypothesis import settings
 
 # Files that start daemons, drives or recorders: one after the other, whatever else runs beside them (pytest -n).
 MACHINE = {
-    *("base_daemon", "base_link", "base_unit", "can", "cli", "console", "crash", "daemon", "demo", "firmware_sim"),
-    *("campaign", "log_runs", "mutants", "ordeal", "recorder", "ring", "service", "trust", "viewers", "waiting"),
+    *("base_daemon", "base_link", "base_unit", "bench", "campaign", "can", "cli", "console", "crash", "daemon", "demo"),
+    *("firmware_sim", "log_runs", "log_tools", "mutants", "obstacle_feed", "ordeal", "recorder", "ring", "service"),
+    *("trust", "view", "viewers", "waiting"),
 }
 
 

@@ -1,7 +1,7 @@
 """Every small change of the code that decides about torque is noticed by a test, or listed with the reason why not.
 
     python -m tools.mutants                     all modules, those killed before are not made again
-    python -m tools.mutants limits guards       some of them, by the last part of their name
+    python -m tools.mutants limits supervisor   some of them, by the last part of their name
     python -m tools.mutants --fresh --jobs 2
 
 What is equal to what stands is in tools/mutants/equal.toml. Exit status 0 when nothing else survives and every row of
@@ -35,7 +35,6 @@ class Target(NamedTuple):
 
 TARGETS = (
     Target("rtctl/arm/limits.py", ("test_arm_limits",), False),
-    Target("rtctl/arm/guards.py", ("test_guards_alone",), False),
     Target("rtctl/arm/faults.py", ("test_faults_alone",), False),
     Target("rtctl/arm/supervision.py", ("test_arm_supervision", "test_faults")),
     Target("rtctl/control/faults.py", ("test_faults_alone",), False),
