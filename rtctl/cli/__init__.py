@@ -60,8 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RtctlError as error:
         return _report(str(error), error.exit_code)
     except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        return _report(f"{place}{error.strerror or error}", EXIT_FAILED)
+        got = (error.strerror or str(error)).lower()
+        words = f"{error.filename}: got {got}, wanted a file that can be opened" if error.filename else got
+        return _report(words, EXIT_FAILED)
 
 
 def _run(argv: list[str]) -> int:

@@ -108,6 +108,7 @@ def _check(arguments: argparse.Namespace) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     passing = frozenset(_stranger(name) for name in arguments.pass_lock_of)
     with ExitStack() as stack:
+        _refuse_scenario(arguments.config)
         lobby = _lobby(arguments.config)
         if lobby is not None:
             stack.enter_context(lobby)
@@ -123,6 +124,13 @@ def _run(arguments: argparse.Namespace) -> int:
             passing=passing,
             lobby=lobby,
         )
+
+
+def _refuse_scenario(config: str) -> None:
+    """Refuse at once what is no robot's file, before anything is compiled for it. Raises ConfigError."""
+    from rtctl.spec.read import refuse_scenario
+
+    refuse_scenario(Path(config))
 
 
 def _lobby(config: str) -> "Lobby | None":
