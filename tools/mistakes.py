@@ -26,8 +26,14 @@ Every refusal has one form: **the place, what came, what was wanted**, with the 
 there is one. It is one line on stderr, never a traceback. Exit code 2 is a wrong call, 78 a refused file, 1 anything
 else that failed. This page is printed by `python -m tools.mistakes`, which makes each mistake for real.
 """
-SECTIONS = ("On the command line", "In a robot's file", "In a scenario", "In a file of goals", "At the control socket",
-            "With files and logs")  # fmt: skip
+SECTIONS = (
+    "On the command line",
+    "In a robot's file",
+    "In a scenario",
+    "In a file of goals",
+    "At the control socket",
+    "With files and logs",
+)
 
 
 class Mistake(NamedTuple):
@@ -206,7 +212,7 @@ MISTAKES: tuple[Mistake, ...] = (
     file("stop", "`rtctl stop` without a daemon"),
     file("status --robot panda", "`rtctl status --robot panda` without a daemon"),
     file("stop --socket none.sock", "`rtctl stop --socket none.sock` without a daemon there"),
-)  # fmt: skip
+)
 
 
 def answer(mistake: Mistake) -> Answer:

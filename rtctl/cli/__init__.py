@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import commission, experiments, logs, offline, operate, plan
+from rtctl.cli import commission, experiments, init, logs, offline, operate, plan
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -34,6 +34,7 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
+    init.add(commands)
     offline.add_before(commands)
     commission.add(commands)
     operate.add(commands)
