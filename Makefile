@@ -4,6 +4,7 @@
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
+# make mutants small changes of what decides about torque, each of which a test must notice: about an hour
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress install lock clean
+.PHONY: demo demo-rover test lint bench stress mutants install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -37,6 +38,9 @@ bench: install
 
 stress: install
 	$(BIN)/python -m tools.stress
+
+mutants: install
+	$(BIN)/python -m tools.mutants
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 

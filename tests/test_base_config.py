@@ -133,14 +133,14 @@ def test_the_shipped_files_pass_and_check_tells_what_follows_from_them(capsys, t
         rows = {row["name"]: row for row in report["rows"]}
         assert rows["signing"]["verdict"] == "warn"
         assert rows["way to rest"]["value"] == pytest.approx(2.0 * 0.83 + 4.0 / 3.0)
-        assert rows["gap that is passed"]["value"] == pytest.approx(2.0 * (0.5 + 0.6 + 0.35 / 2**0.5))
+        assert rows["gap that is passed"]["value"] == pytest.approx(2.0 * (0.5 + 0.6 + 0.35 / 2**0.5) + 0.35)
     assert cli.main(["run", str(ROVER), "--lockstep"]) == 2
     assert "rtctl sim" in capsys.readouterr().err
     bad = tmp_path / "bad.toml"
     bad.write_text(ROVER.read_text().replace("v_max_m_s = 2.0", "v_max_m_s = 200.0"))
     for command in ("check", "run"):
         assert cli.main([command, str(bad)]) == EXIT_CONFIG
-        last = capsys.readouterr().err.splitlines()[-1]
+        last = capsys.readouterr().err.splitlines()[-1]  # `run` says before that it starts
         assert last.startswith(f"rtctl: {bad}: motion.v_max_m_s: got 200.0, wanted")
 
 

@@ -225,7 +225,8 @@ def test_from_the_speed_that_the_governor_allows_the_vehicle_stops_short_of_what
         x = np.array([car.x, car.y])
         push = law.field(BASE, x, 0.0, np.zeros(2), wall, len(wall), none)
         coming = law.ahead_of(BASE, x, 0.0, np.column_stack([sent, 0.0 * sent]))[0][0] - car.x
-        v = min(speed, law.allowed_speed(BASE, x, np.array([1.0, 0.0]), coming, wall, none, push))
+        course = law.Course(np.array([*x, 0.0]), np.array([1.0, 0.0]), coming, False)
+        v = min(speed, law.allowed_speed(BASE, course, wall, none, push))
         sent = np.concatenate([[v], sent[:-1]])
         car.step(v, 0.0, 0.0, 0.02)
     assert wall[0, 0] - car.x - BASE.margins.hull >= BASE.margins.stop - 0.05
@@ -235,9 +236,9 @@ def test_the_governor_sees_told_obstacles_as_far_off_as_they_are():
     ball = Shape("b", "sphere", np.array([0.7, 0, 0, 0]), np.array([5.0, 0.4, 0.3]), UPRIGHT, *np.zeros((2, 3)))
     table, _ = obstacle_table.edited(obstacle_table.empty(), (ObstacleEdit("b", ball),))
     r = BASE.margins.hull + BASE.margins.stop
-    gap = law._gap_known(np.zeros(2), np.array([1.0, 0.0]), r, 0.3, table.obstacles, 30.0)
+    gap = law._gap_known(np.zeros((1, 2)), np.array([1.0, 0.0]), np.array([r]), 0.3, table.obstacles, 30.0)
     assert gap == pytest.approx(5.0 - math.sqrt((0.7 + r) ** 2 - 0.4**2), abs=0.02)
-    assert law._gap_known(np.zeros(2), np.array([0.0, 1.0]), r, 0.3, table.obstacles, 30.0) == math.inf
+    assert law._gap_known(np.zeros((1, 2)), np.array([0.0, 1.0]), np.array([r]), 0.3, table.obstacles, 30.0) == math.inf
 
 
 def test_estimate_is_filterpys_on_the_same_model():

@@ -10,9 +10,11 @@ import pytest
 
 from rtctl.arm import detection
 from rtctl.arm.faults import (
+    ASTRAY,
     AUTOMATIC,
     BIT,
     BRAKES,
+    DISTRUST,
     FAULT_CODES,
     FAULTS,
     JUMP_WINDOW,
@@ -186,6 +188,50 @@ def test_each_word_of_faults_has_the_rows_that_its_name_says():
         assert names(bit) == (fault.name,)
         assert TABLE.severity(bit) == fault.severity
         assert TABLE.stops(bit) == (Severity.NONE if fault.clear == "A" else fault.severity)
+
+
+MOTION = "position speed"
+# Row of the published catalogue, reaction, how it clears, and what it makes untrue.
+CATALOGUE = f"""
+feedback_stale     2  SS2 A
+feedback_lost      2  SS1 R {MOTION} link
+duplicate_reply    4  LOG A
+disorder           5  SS2 R
+corrupt_frames     6  SS2 R
+foreign_command    8  SS1 L torque
+rx_overflow        9  LOG A
+error_passive     10  LOG A
+bus_off           11  SS1 R link
+send_failed       12  SS1 R link
+link_down         13  SS1 R link
+drive_fault       15  SS1 R
+drive_disabled    17  SS1 R
+torque_mismatch   18  SS1 R torque
+encoder_stuck     19  SS1 R {MOTION}
+encoder_jump      20  SS1 R {MOTION}
+velocity_mismatch 21  SS1 R {MOTION}
+not_finite        25  SS1 L {MOTION}
+deadline          30  SS2 R
+goal_in_obstacle  43  SS2 A
+contact           44  SS2 R
+feed_stale        45  SS2 A
+outside_limits    50  SS1 R
+overspeed         50  SS1 R
+innovation        21  SS1 R {MOTION} torque
+log_degraded      51  LOG A
+"""
+
+
+def test_every_row_is_that_of_the_catalogue():
+    wanted = [line.split() for line in CATALOGUE.strip().splitlines()]
+    assert [[f.name, str(f.row), f.severity.name, f.clear, *f.untrue] for f in FAULTS] == wanted
+
+
+def test_what_the_measurements_no_longer_tell_and_what_goes_astray():
+    rows = [line.split() for line in CATALOGUE.strip().splitlines()]
+    distrusted = {row[0] for row in rows if {"position", "speed", "torque"} & set(row[4:])}
+    assert set(names(DISTRUST)) == distrusted
+    assert set(names(ASTRAY)) == distrusted | {"contact", "outside_limits"}
 
 
 ROWS = (

@@ -2,6 +2,7 @@
 
     python -m tools.rover_campaign worlds --seeds 20        # arrives, keeps clear, as fast as an autopilot's own
     python -m tools.rover_campaign sight --runs 400         # knows little, or lies: touches nothing, says why
+    python -m tools.rover_campaign sight --long             # a vehicle of 2 m by 0.7 m, steered as its outline
     python -m tools.rover_campaign bias --seeds 3           # `arrived` agrees with the autopilot's own position
 
 The double's truth judges: distances of the hull to the solids, which the controller never sees. Exit code 1 when a run
@@ -16,6 +17,7 @@ import sys
 from collections.abc import Iterator
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import msgspec
@@ -28,6 +30,7 @@ from rtctl.spec.scenario import FaultTable, Scenario, TimedGoal, load_scenario
 ROOT = Path(__file__).resolve().parent.parent
 ROVER = ROOT / "configs" / "rover.toml"
 WORLDS = {"disc": 22.8, "three": 26.5, "wall": 25.8, "u": 32.1}  # [s] that an autopilot's own avoidance needed
+LONG = "footprint_m = [[1.2, 0.35], [-0.8, 0.35], [-0.8, -0.35], [1.2, -0.35]]"  # [m]
 CLEARANCE = 0.6  # [m] clearance_m of the config
 NEAR = 2.0  # [m] of the goal, where the clock stops
 SPARE = 5.0  # [s] beyond what the autopilot needed, for a run to end in
@@ -43,6 +46,7 @@ class Case(NamedTuple):
     kind: str
     world: str
     scenario: Scenario
+    robot: Path = ROVER
 
 
 class Run(NamedTuple):
@@ -119,6 +123,13 @@ def bias(seeds: int) -> Iterator[Case]:
             yield Case(f"bias {much:g}", "disc", play)
 
 
+def long_robot(folder: Path) -> Path:
+    """Return the config, in a folder, of a rover whose footprint is LONG."""
+    path = folder / "long.toml"
+    path.write_text("\n".join(LONG if line.startswith("radius_m") else line for line in ROVER.read_text().split("\n")))
+    return path
+
+
 def replaced(scenario: Scenario, **changes: Any) -> Scenario:
     """Return a scenario with other values."""
     return msgspec.structs.replace(scenario, **changes)
@@ -132,7 +143,7 @@ def played(case: Case) -> Run:
         places.append((truth.time, truth.x, truth.y, truth.v))
 
     try:
-        found = simulate_scenario(scenario, ROVER, file_of(case.world), watch=watch)
+        found = simulate_scenario(scenario, case.robot, file_of(case.world), watch=watch)
     except RtctlError as error:  # it did not even start
         refuses = case.kind != "worlds" and not case.kind.startswith("bias")  # to start blind: that says why it stands
         return Run(case.kind, case.world, scenario.seed, refuses, False, None, None, math.inf, 0, math.inf, str(error))
@@ -196,6 +207,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=20, help="of worlds and bias")
     parser.add_argument("--runs", type=int, default=400, help="of sight")
     parser.add_argument("--world", choices=tuple(WORLDS), help="of worlds alone")
+    parser.add_argument("--long", action="store_true", help="a footprint of 2 m by 0.7 m instead of a disc")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", action="store_true", help="every run as a line of JSON")
     args = parser.parse_args(arguments)
@@ -204,8 +216,9 @@ def main(arguments: list[str] | None = None) -> int:
     else:
         cases = list(worlds(args.seeds) if args.campaign == "worlds" else bias(args.seeds))
         cases = [case for case in cases if args.world in (None, case.world)]
-    with get_context("spawn").Pool(args.jobs) as pool:
-        runs = []
+    with TemporaryDirectory() as folder, get_context("spawn").Pool(args.jobs) as pool:
+        robot, runs = long_robot(Path(folder)) if args.long else ROVER, []
+        cases = [case._replace(robot=robot) for case in cases]
         for run in pool.imap(played, cases):
             runs.append(run)
             if args.json:

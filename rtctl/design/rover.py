@@ -47,6 +47,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         margins=Margins(
             hull(c),
             hull(c) + a.clearance_m + math.sqrt(0.5) * CELL,
+            a.clearance_m + math.sqrt(0.5) * CELL,
             a.stop_m,
             b.brake_m_s2,
             b.lag_s,
@@ -55,6 +56,7 @@ def build(c: BaseConfig, path: str | Path) -> Base:
         ),
         points=points,
         point_radius=radius,
+        cover=_cover(c),
         field=field_params(m.v_max_m_s, a.influence_m, a.clearance_m, dt, a.damping_ratio, a.lookahead_s, 1.0),
         noise=Noise(c.estimator.acceleration_m_s2, c.estimator.position_m, c.estimator.velocity_m_s),
         safety=SafetyParams(
@@ -109,6 +111,32 @@ def _points(c: BaseConfig) -> tuple[F64, F64]:
     return np.array(found), np.full(len(found), SKIN)
 
 
+def _straight_gap(base: Base) -> list[Row]:
+    """Return what an outline steered as it is passes straight on, a row; none for others."""
+    if not len(base.cover):
+        return []
+    wide = float(np.ptp(base.points[:, 1]))
+    gap = wide + 2.0 * base.margins.aside + 3.0 * CELL  # returns and outline lie in cells, and headings are HEADINGS
+    return [_row("gap straight on", gap, "m", "that the outline passes on a leg")]
+
+
+def _cover(c: BaseConfig) -> F64:
+    """Return points (n, 2) [m] no more than a cell apart along a polygon's edges and within it.
+
+    None of what is steered as a circle: a disc, what cannot turn on the spot, what PX4 turns as it thinks best.
+    """
+    if c.base.footprint_m is None or c.base.wheels != "skid" or c.link.autopilot == "px4":
+        return np.zeros((0, 2))
+    corners = np.array(c.base.footprint_m)
+    rings = max(1, math.ceil(hull(c) / CELL))
+    found = [np.zeros(2)]
+    for scale in np.arange(1, rings + 1) / rings:  # the polygon goes once around the origin, and so do these
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            n = max(1, math.ceil(scale * float(np.hypot(*(b - a))) / CELL))
+            found += [scale * (a + (b - a) * k / n) for k in range(n)]
+    return np.array(found)
+
+
 def report(c: BaseConfig, base: Base) -> Report:
     """Return the figures of a base that `load` and `build` let through."""
     f, m = base.field, base.margins
@@ -138,7 +166,8 @@ def report(c: BaseConfig, base: Base) -> Report:
         _row("rho_num", f.rho_num, "m", f"(3 eta dt^2)^(1/4); at most the clearance {f.rho_min:g}"),
         _row("way to rest", stop, "m", f"{m.lag:g} s of lag and {m.brake:g} m/s2 from {base.limits.v_max:g} m/s"),
         _row("room of a way", m.room, "m", "free distance of its cells' centres: hull, clearance, half a cell"),
-        _row("gap that is passed", 2.0 * m.room, "m", "narrower ones are walls"),
+        _row("gap that is passed", 2.0 * m.room + CELL, "m", "narrower ones may count as walls"),
+        *_straight_gap(base),
         _row("range", base.sense, "m", "of the scan that is believed"),
         _row("reverse", int(base.limits.reverse), "", _ways(base), base.limits.reverse or base.limits.radius == 0.0),
         _row(

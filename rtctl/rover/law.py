@@ -15,6 +15,7 @@ import numpy as np
 
 from rtctl.control.firas import FieldParams, firas
 from rtctl.kernel import kernel
+from rtctl.rover import outline
 from rtctl.rover.occupancy import CELL, Chart, seen_ahead
 from rtctl.rover.robot import Base
 from rtctl.types import F64
@@ -85,8 +86,7 @@ def field(base: Base, x: F64, yaw: float, v: F64, seen: F64, now: int, obstacles
     seen (m, 2) [m] are returns, the first `now` of them of the newest scan: the others are known to a cell alone, good
     to be pushed by, too coarse to say how near something is.
     """
-    c, s = math.cos(yaw), math.sin(yaw)
-    footprint = Footprint(x + base.points @ np.array([[c, s], [-s, c]]), base.point_radius)
+    footprint = Footprint(outline.placed(base.points, x, yaw), base.point_radius)
     sensed, rho_sensed = _sensed(footprint, v, seen, now, base.field)
     known, rho, closing, normal = _known(footprint, v, obstacles, base.margins.height, base.field)
     return Push(sensed, known, rho_sensed, rho, closing, normal)
@@ -200,19 +200,30 @@ def unicycle(base: Base, v_ref: F64, yaw: float) -> tuple[float, float]:
     return ahead, min(max(w, -lim.w_max), lim.w_max)
 
 
-def allowed_speed(
-    base: Base, x: F64, direction: F64, coming: float, seen: F64, obstacles: Obstacles, push: Push
-) -> float:
+class Course(NamedTuple):
+    """Where the base is and which way it moves."""
+
+    pose: F64  # (3,) [m, m, rad]
+    direction: F64  # (2,) unit
+    coming: float  # [m] the way that what was sent will still take
+    legs: bool  # it keeps to a leg: its outline counts, not the circle about it
+
+
+def allowed_speed(base: Base, course: Course, seen: F64, obstacles: Obstacles, push: Push) -> float:
     """Return the speed [m/s] that can be braked to rest before anything ahead; at most V_max.
 
-    direction (2,): unit. coming [m]: the way that what was sent will still take. Straight on, a circle of the hull's
-    radius must not come nearer than `stop` to a return or a known obstacle; one that moves is met with its own speed
-    taken off what may be spent.
+    Straight on, a circle of the hull's radius must not come nearer than `stop` to a return or a known obstacle; one
+    that moves is met with its own speed taken off what may be spent. An outline that is no circle counts itself on a
+    leg, and for what is within that circle already.
     """
     m = base.margins
-    r = m.hull + m.stop
-    gap = _gap_sensed(x, direction, r, seen)
-    gap = min(gap, _gap_known(x, direction, r, m.height, obstacles, HORIZON))
+    x, direction, coming = course.pose[:2], course.direction, course.coming
+    if len(base.cover):
+        gap = _gap_outline(base, course, seen, obstacles)
+    else:
+        r = m.hull + m.stop
+        gap = _gap_sensed(x, direction, r, seen)
+        gap = min(gap, _gap_known(x[None], direction, np.array([r]), m.height, obstacles, HORIZON))
     coming = max(coming, 0.0)
     v = min(base.limits.v_max, spend(gap - coming, m.brake, RESERVE * m.lag))
     for k in np.flatnonzero(push.closing > 0.0):
@@ -223,16 +234,49 @@ def allowed_speed(
     return v
 
 
-def seen_speed(base: Base, chart: Chart, x: F64, direction: F64, coming: float, tick: int) -> float:
+def _gap_outline(base: Base, course: Course, seen: F64, obstacles: Obstacles) -> float:
+    """Return how far [m] an outline that is no circle can move along its course."""
+    m, x, direction = base.margins, course.pose[:2], course.direction
+    points, keeps = outline.placed(base.points, x, course.pose[2]), base.point_radius + m.stop
+    wide = m.hull + m.stop
+    gap = outline.gap_past(points, keeps, x, direction, 0.0 if course.legs else wide, seen)
+    by_circle = (
+        math.inf if course.legs else _gap_known(x[None], direction, np.array([wide]), m.height, obstacles, HORIZON)
+    )
+    if course.legs or by_circle == 0.0:
+        by_circle = _gap_known(points, direction, keeps, m.height, obstacles, HORIZON)
+    return min(gap, by_circle)
+
+
+def way_of_turn(base: Base) -> float:
+    """Return the angle [rad] from w_max to rest: lag first, then at alpha_max."""
+    lim = base.limits
+    return lim.w_max * base.margins.turn_lag + lim.w_max**2 / (2.0 * lim.alpha_max) + outline.FINE
+
+
+def held_turn(base: Base, w: float, free: float, coming: float) -> float:
+    """Return the yaw rate [rad/s] towards w, at most that, from which a turn ends within `free` [rad].
+
+    coming [rad]: what was sent will still turn that way.
+    """
+    most = spend(free - max(coming, 0.0), base.limits.alpha_max, RESERVE * base.margins.turn_lag)
+    return math.copysign(min(abs(w), most), w)
+
+
+def seen_speed(base: Base, chart: Chart, course: Course, tick: int) -> float:
     """Return the speed [m/s] that can be braked to rest within what was seen free ahead of the hull; at most V_max.
 
-    coming [m]: the way that what was sent will still take. Space that was seen some time ago counts, for less: from
+    Space that was seen some time ago counts, for less: from
     half of `seen` [s] on the speed falls with its age, so that the base rests by when it counts no more.
     """
     m, most = base.margins, base.limits.v_max
+    coming = course.coming
     reach = way_to_rest(base) + max(coming, 0.0)
     oldest = tick - round(base.safety.seen / base.dt)
-    gap, first = seen_ahead(chart, x, direction, m.hull, reach, oldest)
+    if course.legs:
+        gap, first = outline.strip_seen(base, chart, course.pose, course.direction, reach, oldest)
+    else:
+        gap, first = seen_ahead(chart, course.pose[:2], course.direction, m.hull, reach, oldest)
     age = max(tick - first, 0) * base.dt / base.safety.seen
     fades = most * min(2.0 - 2.0 * age, 1.0)
     return min(max(fades, 0.0), spend(gap - 0.5 * CELL - max(coming, 0.0), m.brake, RESERVE * m.lag))
@@ -266,24 +310,29 @@ def _gap_sensed(x: F64, e: F64, r: float, seen: F64) -> float:
 
 
 @kernel
-def _gap_known(x: F64, e: F64, r: float, height: float, obstacles: Obstacles, horizon: float) -> float:
-    """Return the same for known obstacles: steps as long as the free distance never jump over one."""
-    slots = obstacles.active.shape[0]
-    P, none, out = np.empty((3, 1)), np.zeros(1), np.zeros((slots, 4, 1))
+def _gap_known(x: F64, e: F64, r: F64, height: float, obstacles: Obstacles, horizon: float) -> float:
+    """Return the same of circles of radii r (m,) about x (m, 2) for known obstacles.
+
+    Steps as long as the free distance never jump over one.
+    """
+    slots, m = obstacles.active.shape[0], x.shape[0]
+    P, none, out = np.empty((3, m)), np.zeros(m), np.zeros((slots, 4, m))
     s = 0.0
     for turn in range(60):
-        P[0, 0], P[1, 0], P[2, 0] = x[0] + s * e[0], x[1] + s * e[1], height
+        for j in range(m):
+            P[0, j], P[1, j], P[2, j] = x[j, 0] + s * e[0], x[j, 1] + s * e[1], height
         distances_into(P, none, obstacles, math.inf, out)
         rest = math.inf
         for k in range(slots):
-            d = out[k, 0, 0] - r
             if not obstacles.active[k]:
                 continue
-            if turn == 0 and d <= 0.0:  # already nearer than that: it may leave, not come closer
-                if out[k, 1, 0] * e[0] + out[k, 2, 0] * e[1] < 0.0:
-                    return 0.0
-                continue
-            rest = min(rest, d)
+            for j in range(m):
+                d = out[k, 0, j] - r[j]
+                if turn == 0 and d <= 0.0:  # already nearer than that: it may leave, not come closer
+                    if out[k, 1, j] * e[0] + out[k, 2, j] * e[1] < 0.0:
+                        return 0.0
+                    continue
+                rest = min(rest, d)
         if rest < 0.01:
             return s
         s += rest

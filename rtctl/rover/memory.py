@@ -76,6 +76,7 @@ class BaseMemory(NamedTuple):
     w: float  # [rad/s]
     allowed_seen: float  # [m/s] by what was seen ahead
     blind: int  # ticks that this has held the base
+    dark: int  # ticks that what was not seen has held a turn of an outline that is no circle
     unfixed: float  # [s] without a GPS that there was
     asked: F64  # (2,) [m/s, rad/s] twist that was asked for, as late as it takes effect, smoothed
     did: F64  # (2,) the twist that came of it, smoothed alike

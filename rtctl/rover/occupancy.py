@@ -222,6 +222,12 @@ def free_distance(chart: Chart, obstacles: Obstacles, height: float) -> F64:
     return field
 
 
+def at(free: F64, origin: I64, x: F64) -> float:
+    """Return the free distance [m] of the cell that x (2,) [m] lies in, infinite beyond the window."""
+    i, j = (int(k) for k in np.floor(x / CELL).astype(np.int64) - origin)
+    return float(free[i, j]) if 0 <= i < SIZE and 0 <= j < SIZE else math.inf
+
+
 @kernel
 def _free(cells: U8Grid, origin: I64, obstacles: Obstacles, height: float, field: F64) -> None:
     far = STENCIL * CELL

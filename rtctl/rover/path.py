@@ -28,6 +28,7 @@ class Way(NamedTuple):
     corners: F64  # (k, 2) [m], the last is the end; empty: no way is known
     length: float  # [m] from the base
     short: float  # [m] from its end to the goal; 0: it reaches it
+    start: F64 | None = None  # (2,) [m] where its first leg begins; None: a string for the circle about the outline
 
 
 NO_WAY = Way(np.zeros((0, 2)), math.inf, math.inf)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from rtctl.kernel import reductions as scans
-from rtctl.rover import estimator, law, occupancy, path, turn
+from rtctl.rover import estimator, law, legs, occupancy, outline, path, turn
 from rtctl.rover.faults import BIT, FAULTS, Counters, severity
 from rtctl.rover.memory import NO_LOOK, BaseMemory
 from rtctl.rover.record import make_base_record
@@ -23,11 +23,13 @@ NEAR = 6.0  # [m] that returns are looked at around the base
 BEAM_TICKS = 5  # between two looks of the single sensors
 SLOW = 0.25  # of V_max while the position is reckoned, or the autopilot's own estimator is at its bound
 BLIND_SPEED = 0.1  # [m/s] below it the base stands for what it has not seen
+BLIND_TURN = 0.05  # [rad/s] below it the base does not turn for what it has not seen
 BLIND_TIME = 0.5  # [s] before that is a status
 SMOOTH = 1.0  # [s] over which asked and done are compared
 ASKED = np.array([0.3, 0.3])  # [m/s, rad/s] that must be asked for before it is asked what came of it
 LITTLE = 0.4  # of it
 TURN_SPEED = 0.05  # [m/s] of v_ref below which the base turns on the spot
+DETOUR = 1.2  # times as long as the straight line, from which on a way is asked whether the outline has a shorter one
 PROGRESS = 0.3  # [m] by which the way must become shorter to count
 SIGHTLESS = BIT["scan_stale"] | BIT["scan_wrong"]
 Judged = tuple[F64, law.Push, F64, float]  # v_ref wanted, field, xd_d, allowed speed
@@ -93,6 +95,7 @@ def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
         scans=tuple(np.zeros((0, 2)) for _ in base.sensors),
         allowed_seen=0.0,
         blind=0,
+        dark=0,
         unfixed=0.0,
         asked=np.zeros(2),
         did=np.zeros(2),
@@ -159,7 +162,10 @@ def _perceived(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, ela
     if m.tick % BEAM_TICKS == 0 and (f.beams >= 0.0).any():
         scan = occupancy.PlacedScan(m.here.x, m.here.yaw, -0.25 * math.pi, f.beams, min(f.beam_reach, base.sense))
         seen = occupancy.integrate_scan(seen, scan, m.tick)
-    seen = occupancy.stood(seen, m.here.x, base.margins.hull, m.tick)
+    if len(base.cover):
+        seen = outline.stood(seen, base.cover, m.here.x, m.here.yaw, m.tick)
+    else:
+        seen = occupancy.stood(seen, m.here.x, base.margins.hull, m.tick)
     rho = m.goal_rho if m.goal is None else goal_distance(base, table, m.goal)
     return m._replace(world=table, refusal=refusal, chart=seen, scans=scans, due=due, goal_rho=rho)
 
@@ -196,21 +202,55 @@ def _guided(base: Base, m: BaseMemory) -> BaseMemory:
     """Keep the way to the goal; look for it anew when a scan came or its time has."""
     if m.goal is None or m.state != State.RUN:
         return m
-    x, goal, room = m.here.x, m.goal.position[:2], base.margins.room
+    goal = m.goal.position[:2]
     if m.tick >= m.due:
-        free = occupancy.free_distance(m.chart, m.world.obstacles, base.margins.height)
-        way = path.way_to(free, m.chart.origin, x, goal, room, m.way)
-        m = m._replace(free=free, way=way, due=m.tick + max(1, round(base.plan_dt / base.dt)))
+        m = m._replace(free=occupancy.free_distance(m.chart, m.world.obstacles, base.margins.height))
+        m = m._replace(way=_way(base, m, goal), due=m.tick + max(1, round(base.plan_dt / base.dt)))
     else:
-        kept = path.remaining(m.free, m.chart.origin, x, m.way, room)
+        kept = _left(base, m, m.here.x)
         m = m._replace(way=kept, due=m.due if len(kept.corners) else m.tick + 1)
     whole = m.way.length + m.way.short
     gained = whole < m.nearest - PROGRESS
     m = turn.look_around(base, m)
     heading = turn.wanted(base, m)
     heading = m.look.heading if math.isnan(heading) else heading
+    heading = turn.onto_leg(base, m) if math.isnan(heading) else heading
     still = 0 if gained or not math.isnan(heading) else m.still + 1
     return m._replace(nearest=whole if gained else m.nearest, still=still, turn=heading)
+
+
+def _way(base: Base, m: BaseMemory, goal: F64) -> path.Way:
+    """Return the way to goal (2,) [m]: of the circle about the outline, or of the outline where that is shorter."""
+    x, origin, room = m.here.x, m.chart.origin, base.margins.room
+    on_legs = m.way.start is not None
+    way = path.way_to(m.free, origin, x, goal, room, path.NO_WAY if on_legs else m.way)
+    if not len(base.cover):
+        return way
+    reaches = way.short == 0.0 and len(way.corners) > 0 and occupancy.at(m.free, origin, x) >= room
+    if reaches and way.length <= DETOUR * math.dist(x, goal) + base.margins.hull:
+        return way
+    pose = np.array([*x, m.here.yaw])
+    kept = legs.legs_left(m.free, origin, base.cover, pose, m.way, base.margins.aside) if on_legs else path.NO_WAY
+    if not len(kept.corners):
+        kept = legs.legs_to(m.free, origin, base.cover, pose, goal, base.margins.aside)
+    return kept if len(kept.corners) and (not reaches or kept.length < way.length) else way
+
+
+def _left(base: Base, m: BaseMemory, x: F64) -> path.Way:
+    """Return what is left of the way at x (2,) [m]."""
+    if m.way.start is None:
+        return path.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
+    return legs.legs_left(m.free, m.chart.origin, base.cover, np.array([*x, m.here.yaw]), m.way, base.margins.aside)
+
+
+def _towards(base: Base, m: BaseMemory, x: F64) -> F64:
+    """Return xd_d (2,) [m/s] at x (2,) [m]: along the leg, or to the corner of the way that is next."""
+    if m.way.start is not None:
+        place, length = legs.aimed_at(m.way, x)
+        return law.desired(base, x, place, length)
+    way = path.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
+    way = way if len(way.corners) else m.way  # from where it will be no corner is in sight: head on
+    return law.desired(base, x, way.corners[0], way.length)
 
 
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
@@ -224,9 +264,7 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
         rests = m.status == Status.ARRIVED or not math.isnan(m.turn)
         total = _pushed(base, push, rests)
         if m.goal is not None and not rests and len(m.way.corners):
-            way = path.remaining(m.free, m.chart.origin, x, m.way, base.margins.room)
-            way = way if len(way.corners) else m.way  # from where it will be no corner is in sight: head on
-            xd_d = law.desired(base, x, way.corners[0], way.length)
+            xd_d = _towards(base, m, x)
     v_ref = law.integrated(base, m.v_ref, xd_d, total, elapsed) if driving(m) else np.zeros(2)
     if m.state == State.RUN and not moves:
         v_ref = np.zeros(2)  # SS2: zero twist, at once
@@ -238,12 +276,15 @@ def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[Ba
         sign = 1.0 if law.unicycle(base, v_ref, yaw)[0] >= 0.0 else -1.0
         direction = sign * np.array([math.cos(yaw), math.sin(yaw)])
     coming = float((x - m.here.x) @ direction)
-    allowed = law.allowed_speed(base, m.here.x, direction, coming, seen, m.world.obstacles, push)
+    here, legged = np.array([*m.here.x, m.here.yaw]), m.way.start is not None
+    course = law.Course(here, direction, coming, legged)
+    allowed = law.allowed_speed(base, course, seen, m.world.obstacles, push)
     allowed = min(allowed, base.limits.v_max * _calm(f))
     by_sight = base.limits.v_max
     if base.safety.scan:
-        by_sight = law.seen_speed(base, m.chart, m.here.x, direction, coming, m.tick)
-        by_sight = min(by_sight, law.seen_speed(base, m.chart, x, direction, 0.0, m.tick))
+        by_sight = law.seen_speed(base, m.chart, course, m.tick)
+        then = law.Course(np.array([*x, yaw]), direction, 0.0, legged)
+        by_sight = min(by_sight, law.seen_speed(base, m.chart, then, m.tick))
     dark = by_sight < min(BLIND_SPEED, allowed)
     keeps = m.blind if dark and m.status == Status.BLIND else 0  # a stop to look is no end of it
     blind = m.blind + 1 if dark and speed > 0.05 else keeps
@@ -313,10 +354,28 @@ def _commanded(
         if m.state == State.RUN:
             v = min(max(v, m.v - 3.0 * lim.a_max * elapsed), m.v + lim.a_max * elapsed) if abs(v) > abs(m.v) else v
             w = min(max(w, m.w - lim.alpha_max * elapsed), m.w + lim.alpha_max * elapsed)
+        if len(base.cover):
+            m, w = _turned(base, m, f, w)
     if m.state != State.RUN and ask == Ask.DRIVE and m.state != State.STOPPING:
         v, w, velocity = 0.0, 0.0, np.zeros(2)
     sent = np.concatenate([[[v, w]], m.sent[:-1]])
     return m._replace(v_ref=v_ref, v=v, w=w, sent=sent), BaseCommand(ask, v, w, velocity)
+
+
+def _turned(base: Base, m: BaseMemory, f: BaseFeedback, w: float) -> tuple[BaseMemory, float]:
+    """Return the yaw rate [rad/s] whose turn an outline that is no circle can end before it is too near, or unseen."""
+    if w == 0.0:
+        return m._replace(dark=0), 0.0
+    pose, side, most = np.array([*m.here.x, m.here.yaw]), math.copysign(1.0, w), law.way_of_turn(base)
+    coming = side * estimator.wrapped(_ahead(base, m)[1] - m.here.yaw)
+    free = outline.turn_free(base, pose, side, most, _surroundings(m, f)[0], m.world.obstacles)
+    held, dark = w if free >= most else law.held_turn(base, w, free, coming), False
+    if base.safety.scan:
+        free = outline.turn_seen(base, m.chart, pose, side, most, m.tick - round(base.safety.seen / base.dt))
+        by_sight = w if free >= most else law.held_turn(base, w, free, coming)
+        dark = abs(by_sight) < min(abs(held), BLIND_TURN)
+        held = math.copysign(min(abs(held), abs(by_sight)), w)
+    return m._replace(dark=m.dark + 1 if dark else 0), held
 
 
 def _asked(base: Base, m: BaseMemory, f: BaseFeedback) -> Ask:
@@ -344,7 +403,7 @@ def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
     moves = math.hypot(*m.here.v) >= 0.3 or (turn.heading_of(m.goal) == m.turn and abs(m.here.yaw_rate) >= 0.1)
     if there and (m.status == Status.ARRIVED or not moves):
         return m._replace(status=Status.ARRIVED, blocker=-1, still=0)
-    dark = m.blind * base.dt >= BLIND_TIME or not math.isnan(m.look.heading)
+    dark = max(m.blind, m.dark) * base.dt >= BLIND_TIME or not math.isnan(m.look.heading)
     if (dark or m.in_force & SIGHTLESS) and math.hypot(*m.here.v) < 0.2:
         return m._replace(status=Status.BLIND, blocker=-1)
     if m.still * base.dt < base.stall:

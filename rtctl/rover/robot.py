@@ -34,6 +34,7 @@ class Margins(NamedTuple):
 
     hull: float  # [m] radius of the circle about the origin that holds the footprint
     room: float  # [m] free distance of a cell's centre that a way keeps to
+    aside: float  # [m] the same of every point of an outline that is no circle
     stop: float  # [m] the speed governor brings the base to rest at this distance
     brake: float  # [m/s2] it relies on
     lag: float  # [s] from a set-point to the speed it asks for; the state is predicted by it
@@ -79,6 +80,7 @@ class Base(NamedTuple):
     margins: Margins
     points: F64  # (m, 2) [m] PSPs of the footprint in the body's frame
     point_radius: F64  # (m,) [m]
+    cover: F64  # (n, 2) [m] points all over an outline steered as it is; none: as the circle about it
     field: FieldParams
     noise: Noise
     safety: SafetyParams

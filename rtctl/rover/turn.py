@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from rtctl.rover import law, occupancy
+from rtctl.rover import law, legs, occupancy
 from rtctl.rover.estimator import wrapped
 from rtctl.rover.memory import NO_LOOK, BaseMemory, Look
 from rtctl.rover.robot import Base
@@ -27,6 +27,8 @@ STEP = 0.3  # [m] away that is another place
 FRESH = 0.75  # of the time that what was seen counts for, after which it is looked at anew
 FACING = 0.15  # [rad] from where it wants to go that counts as facing it
 LOOK_TOLERANCE = 0.1  # [rad]
+LEAVE = 0.25  # [rad] off the heading of its leg at which the base stops and turns to it again
+SLIDES = 0.15  # [m/s] above which it does not turn
 SLACK = 0.6  # [s] beside turning and lag for a scan to come
 SETTLED = 1.0  # [s] at rest after which the whole tolerance will do
 
@@ -70,10 +72,24 @@ def wanted(base: Base, m: BaseMemory) -> float:
     return heading_of(m.goal) if near else math.nan
 
 
+def onto_leg(base: Base, m: BaseMemory) -> float:
+    """Return the heading [rad] of the leg that the base is to turn to, NaN while it faces along it, or has none.
+
+    It comes to rest first: a base that turns while it slides sweeps more than its outline.
+    """
+    heading = legs.heading(m.way)
+    if math.isnan(heading):
+        return math.nan
+    turning = not math.isnan(m.turn)
+    if abs(wrapped(heading - m.here.yaw)) <= (FULL * LOOK_TOLERANCE if turning else LEAVE):
+        return math.nan
+    return m.here.yaw if math.hypot(*m.here.v) > SLIDES else heading
+
+
 def rate(base: Base, m: BaseMemory, yaw: float) -> float:
     """Return the yaw rate [rad/s] to m.turn from yaw [rad]: braked at half alpha_max, none when little is left."""
-    looks = m.goal is None or m.turn == m.look.heading
-    angle, tolerance = wrapped(m.turn - yaw), LOOK_TOLERANCE if looks or m.goal is None else m.goal.tolerance_rot
+    asked = m.goal is not None and m.turn == heading_of(m.goal) and m.turn != m.look.heading
+    angle, tolerance = wrapped(m.turn - yaw), m.goal.tolerance_rot if asked and m.goal is not None else LOOK_TOLERANCE
     if abs(angle) <= FULL * tolerance:
         return 0.0
     fast = min(base.limits.w_max, GAIN * abs(angle), math.sqrt(base.limits.alpha_max * abs(angle)))

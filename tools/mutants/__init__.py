@@ -1,0 +1,1 @@
+"""Mutants: small changes of the code that decides about torque, each of which a test must notice."""
