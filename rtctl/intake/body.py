@@ -92,6 +92,7 @@ def describe(source: Source, exclude: Sequence[str] = ()) -> Described:
         if lost:
             told.append(f"{len(lost)} meshes are not there and left out: {', '.join(sorted(set(lost))[:3])}")
         _exclude(root, exclude)
+        _told_apart(root)
         mimic = frozenset(j.get("name", "") for j in root.iter("joint") if j.find("mimic") is not None)
         for joint in root.iter("joint"):
             for tag in joint.findall("mimic"):
@@ -100,7 +101,7 @@ def describe(source: Source, exclude: Sequence[str] = ()) -> Described:
         model = pin.buildModelFromXML(text)
         collision, visual = (pin.buildGeomFromUrdfString(model, text, kind) for kind in _KINDS)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise IntakeError(f"{source.path}: cannot be read: {' '.join(str(error).split())[:200]}") from None
+        raise IntakeError(f"{source.path.name}: cannot be read: {' '.join(str(error).split())[:200]}") from None
     return Described(model, collision, visual, mimic, {}, told)
 
 
@@ -141,6 +142,19 @@ def _exclude(root: ET.Element, links: Sequence[str]) -> None:
     for link in root.findall("link"):
         if link.get("name") in gone:
             root.remove(link)
+
+
+def _told_apart(root: ET.Element) -> None:
+    """Rename links that are called as joints are: one name, one frame."""
+    joints = {joint.get("name", "") for joint in root.findall("joint")}
+    ends = [end for joint in root.findall("joint") for end in (*joint.findall("parent"), *joint.findall("child"))]
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if name in joints:
+            link.set("name", f"{name}_link")
+            for end in ends:
+                if end.get("link") == name:
+                    end.set("link", f"{name}_link")
 
 
 def _link(joint: ET.Element, end: str) -> str:

@@ -26,6 +26,7 @@ SPEED_MIN = 3.0  # [rad/s] below which a joint's own limit is left as it is
 CARRY = 1.15  # an effort that is less than this times gravity's largest torque is taken for a mistake
 SPARE = 2.5  # times gravity's largest torque: what is assumed in its place
 DENSITY = 700.0  # [kg/m3] of links whose inertia is repaired: about that of arms of aluminium and motors
+TORQUE_MAX = 2000.0  # [Nm] of a joint, as a config takes it
 POSTURES = 300
 
 
@@ -106,6 +107,9 @@ def _complete(
     joints, mute, still = [], list[str](), list[str]()
     for joint, load in zip(arm.joints, gravity, strict=True):
         assumed = float(f"{max(SPARE * load, 1.0):.2g}")
+        if assumed > TORQUE_MAX and not joint.effort >= CARRY * load:
+            wanted = f"at most {TORQUE_MAX:g} Nm: no drive on CAN turns that"
+            raise IntakeError(f"{joint.name}: got an arm of {load:.3g} Nm by gravity alone, wanted {wanted}")
         if math.isnan(joint.effort):
             mute.append(f"{joint.name} {assumed:g} Nm")
             joint = joint._replace(effort=assumed)

@@ -52,9 +52,10 @@ def find(what: str) -> Source:
     if package == FETCHED:
         return _fetched(name)
     known = {key: places for key, places in index().items() if not package or package in places}
-    key = name.lower() if name.lower() in known else SHORT.get(name.lower(), name.lower())
+    key = re.sub(r"[^a-z0-9_]", "_", name.lower())
+    key = SHORT.get(key, key) if SHORT.get(key) in known else key
     if key not in known:
-        alike = [each for each in known if name.lower() in each]
+        alike = [each for each in known if key in each]
         if len(alike) != 1:
             missing = [each for each in PACKAGES if each not in {p for places in index().values() for p in places}]
             more = f"; not installed: {', '.join(INSTALL.get(p, p) for p in missing)}" if missing else ""
@@ -126,7 +127,8 @@ def urdf_text(path: Path) -> str:
     try:
         return str(xacro.process_file(str(path)).toxml())
     except Exception as error:
-        raise IntakeError(f"{path}: xacro: {' '.join(str(error).split())[:200]}") from None
+        words = re.sub(r"<class '[^']*'>: |" + re.escape(f"{path}: "), "", " ".join(str(error).split()))
+        raise IntakeError(f"{path.name}: xacro: {words[:200]}") from None
     finally:
         substitution_args._eval_find = before
 
