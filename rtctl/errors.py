@@ -1,5 +1,7 @@
 """The error tree: start-up and user mistakes only; run-time faults are values, not exceptions."""
 
+from importlib.util import find_spec
+
 EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -60,3 +62,12 @@ class LogError(RtctlError):
 
 class PlanError(RtctlError):
     """The planner found no way: none exists, or it did not find it within its bounds."""
+
+
+def needs(extra: str, *modules: str) -> None:
+    """Raise UsageError unless the modules of an optional part are installed, and say how to get them."""
+    lacking = [name for name in modules if find_spec(name) is None]
+    if lacking:
+        raise UsageError(
+            f"this needs rtctl[{extra}]: pip install 'rtctl[{extra}]' ({', '.join(lacking)} not installed)"
+        )

@@ -22,6 +22,8 @@ FLAGS = (
     "--disable-sync",
     "--hide-scrollbars",
 )
+DRAWS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
+SCRIPT = 120_000  # [ms] a page that draws in software answers late
 HELP = "apt-get install -y --no-install-recommends chromium chromium-driver"
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # of the WebDriver standard
 
@@ -52,7 +54,8 @@ class Browser:
             "args": [*self._flags, f"--user-data-dir={self._folder.name}/profile"],
         }
         logs = {"browser": "ALL"}
-        wanted = {"alwaysMatch": {"goog:chromeOptions": options, "goog:loggingPrefs": logs}}
+        wait = {"script": SCRIPT}
+        wanted = {"alwaysMatch": {"goog:chromeOptions": options, "goog:loggingPrefs": logs, "timeouts": wait}}
         self._session = self._call("POST", "", {"capabilities": wanted})["sessionId"]
         return self
 

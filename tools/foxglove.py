@@ -25,7 +25,7 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from tools.browser import Browser, missing
+from tools.browser import DRAWS, Browser, missing
 
 PACKAGES = {"core": "@foxglove/studio-base@1.48.0", "react": "react@17.0.2", "dom": "react-dom@17.0.2"}
 PAGE = """<!doctype html><meta charset="utf-8"><style>html,body,#root{height:100%;margin:0}</style><div id="root"></div>
@@ -127,7 +127,7 @@ def look(site: Path, log: Path, layout: Path, at: float, wait: float, png: Path)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     root = f"http://127.0.0.1:{server.server_address[1]}"
     try:
-        with Browser(("--use-angle=swiftshader", "--enable-unsafe-swiftshader")) as browser:
+        with Browser(DRAWS) as browser:
             browser.resize(1760, 1000)
             browser.go(f"{root}/?ds=remote-file&time={moment}&ds.url={root}/log.mcap")
             browser.wait("document.body.innerText.includes('/tick')")

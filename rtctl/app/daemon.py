@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Generic, NamedTuple
+from typing import Generic, NamedTuple, Protocol
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from rtctl.hal.console import Console
 from rtctl.hal.lobby import Lobby
 from rtctl.hal.service import InstanceLock, Service
 from rtctl.log.header import Header
-from rtctl.log.record.recorder import Recorder
+from rtctl.log.record.recorder import Recorder, Stats
 from rtctl.plain import Json
 from rtctl.spec.robot import LogTable
 from rtctl.types import Link, State, Verb
@@ -82,12 +82,13 @@ def run(
     vehicle = vehicle_of(path)
     if lockstep and not vehicle.keeps_step:
         raise UsageError("--lockstep is for drives on a bus; `rtctl sim` plays a base in lockstep")
-    return _run(vehicle, vehicle.load(path, timeout), How(lockstep, dry, passing, lobby))
+    return _run(vehicle, vehicle.load(path, timeout), How(path, lockstep, dry, passing, lobby))
 
 
 class How(NamedTuple):
     """How a daemon was asked to run: the arguments of `run`."""
 
+    path: Path  # of the robot's file
     lockstep: bool
     dry: bool
     passing: Collection[int]
@@ -113,7 +114,7 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         told = {**header.extra, **surroundings(setup.loop.realtime, link.counters, dry)}
         listener = lobby.hand_over()  # before the recorder: it is a process of its own
         console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link), listener=listener)))
-        recorder = _recorder(setup.log, header._replace(extra=told))
+        recorder = _recorder(setup.log, header._replace(extra=told), how.path)
         servo = Servo(vehicle, robot, link, recorder, start, dry)
         queue = GoalQueue()
         console.publish(
@@ -175,7 +176,7 @@ def surroundings(realtime: str, counters: tuple[int, ...], dry: bool) -> dict[st
     }
 
 
-def _recorder(log: LogTable, header: Header) -> Recorder:
+def _recorder(log: LogTable, header: Header, path: Path) -> Recorder:
     return Recorder.start(
         log.directory,
         header,
@@ -183,6 +184,7 @@ def _recorder(log: LogTable, header: Header) -> Recorder:
         segment_s=log.segment_s,
         segment_bytes=round(log.segment_MB * 1e6),
         floor_bytes=round(log.disk_floor_MB * 1e6),
+        config=path,
     )
 
 
@@ -242,7 +244,13 @@ def _summary(servo: Servo[R, M, F, C], log: Path, dropped: int) -> str:
     )
 
 
-def status(servo: Servo[R, M, F, C], recorder: Recorder) -> Json:
+class Recording(Protocol):
+    """What knows how the log is."""
+
+    def stats(self) -> Stats: ...
+
+
+def status(servo: Servo[R, M, F, C], recorder: Recording) -> Json:
     """Return what `rtctl status` shows."""
     m, robot, stats = servo.memory, servo.robot, recorder.stats()
     return {
@@ -271,4 +279,4 @@ def world(servo: Servo[R, M, F, C]) -> Json:
     rows = {key: getattr(known.obstacles, key)[slots] for key in ("kind", "R", "p", "v", "w", "dims", "margin")}
     starts = dict(zip(known.known.starts, known.known.names, strict=True))
     meshes = [starts[int(d[3])] if kind == MESH else "" for kind, d in zip(rows["kind"], rows["dims"], strict=True)]
-    return {"names": [known.names[k] for k in slots], "meshes": meshes, "obstacles": rows}
+    return {"names": [known.names[k] for k in slots], "slots": slots, "meshes": meshes, "obstacles": rows}

@@ -4,15 +4,18 @@ The controller is the daemon's own servo on the same bytes; only the bus is a fu
 from the simulator's account of the truth, which the controller never sees.
 """
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from rtctl.app.choose import vehicle_of
+from rtctl.app.live import Live
 from rtctl.app.servo import Servo
 from rtctl.app.tally import number
-from rtctl.app.vehicle import C, F, M, Play, R, Turn
+from rtctl.app.vehicle import C, F, M, Play, R, Sink, Turn
 from rtctl.hal.clock import lockstep
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
@@ -21,11 +24,19 @@ Watch: TypeAlias = Callable[[Any, Any, Any], None]  # is shown servo, truth and 
 
 
 def simulate(
-    path: str | Path, log: str | Path | None = None, realtime: bool = False, watch: Watch | None = None
+    path: str | Path,
+    log: str | Path | None = None,
+    realtime: bool = False,
+    watch: Watch | None = None,
+    shown: Callable[[Path], None] | None = None,
 ) -> Json:
-    """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked."""
+    """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked.
+
+    shown: people see it, in real time, and may command it; is told of the ring that viewers look into, and the scenario
+    begins when it returns. When that is over the robot goes on, until a KeyboardInterrupt.
+    """
     scenario = load_scenario(path)
-    return simulate_scenario(scenario, robot_file(scenario, path), Path(path), log, realtime, watch)
+    return simulate_scenario(scenario, robot_file(scenario, path), Path(path), log, realtime, watch, shown)
 
 
 def simulate_scenario(
@@ -35,25 +46,43 @@ def simulate_scenario(
     log: str | Path | None = None,
     realtime: bool = False,
     watch: Watch | None = None,
+    shown: Callable[[Path], None] | None = None,
 ) -> Json:
     """Return the figures of a scenario for the robot file `where`; paths in it are relative to the file `source`."""
     vehicle = vehicle_of(where)
     setup = vehicle.load(where, None)
     play = setup.simulate(scenario, source)
-    robot, link, sink = play.robot, play.link, None
-    try:
+    robot, link = play.robot, play.link
+    with ExitStack() as stack:
+        stack.callback(link.close)
         start = link.greet(True)
+        sinks: list[Sink] = []
+        live = None
         if log is not None:
             from rtctl.log.record.writer import McapSink
 
-            sink = McapSink(Path(log), setup.header(robot, start, link))
-        servo = Servo(vehicle, robot, link, sink, start, stamp=lambda now: round(now * 1e9))
-        begun, ticks = time.perf_counter(), _played(servo, scenario, play, realtime, watch)
+            file = McapSink(Path(log), setup.header(robot, start, link))
+            stack.callback(file.close, "end")
+            sinks.append(file)
+        if shown is not None:
+            live = stack.enter_context(
+                closing(Live(setup.header(robot, start, link), where, Path(log) if log else None))
+            )
+            sinks.append(live)
+        servo = Servo(vehicle, robot, link, _sink(sinks), start, stamp=lambda now: round(now * 1e9))
+        if live is not None and shown is not None:
+            live.serve(servo)
+            shown(live.ring)
+        begun, ticks = time.perf_counter(), _played(servo, scenario, play, realtime, watch, live)
         elapsed = time.perf_counter() - begun
-    finally:
-        if sink is not None:
-            sink.close("end")
-        link.close()
+        found = _figures(servo, play, ticks, elapsed)
+        if live is not None:
+            _linger(servo, play, live, ticks)
+    return found
+
+
+def _figures(servo: Servo[R, M, F, C], play: Play[R, M, F, C], ticks: int, elapsed: float) -> Json:
+    vehicle, robot = servo.vehicle, servo.robot
     return {
         **play.figures(servo.events),
         "mode_final": servo.memory.state.name,
@@ -65,8 +94,28 @@ def simulate_scenario(
     }
 
 
+def _sink(sinks: list[Sink]) -> Sink | None:
+    return Both(sinks) if len(sinks) > 1 else sinks[0] if sinks else None
+
+
+class Both(NamedTuple):
+    """Several sinks as one."""
+
+    sinks: list[Sink]
+
+    def put_many(self, kind: int, payloads: Sequence[bytes], time_ns: int) -> bool:
+        """Put into all of them; return whether all took it."""
+        took = [sink.put_many(kind, payloads, time_ns) for sink in self.sinks]
+        return all(took)
+
+
 def _played(
-    servo: Servo[R, M, F, C], scenario: Scenario, play: Play[R, M, F, C], realtime: bool, watch: Watch | None
+    servo: Servo[R, M, F, C],
+    scenario: Scenario,
+    play: Play[R, M, F, C],
+    realtime: bool,
+    watch: Watch | None,
+    live: Live | None,
 ) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
     dt, begun = servo.robot.dt, time.monotonic()
@@ -74,11 +123,25 @@ def _played(
     for slot in lockstep():
         if play.look() >= scenario.duration_s or slot.slot * dt > scenario.duration_s + play.arm_time:
             break
-        turn: Turn[F, C] = servo.turn(slot, play.request(servo.memory))
+        request = play.request(servo.memory)
+        turn: Turn[F, C] = servo.turn(slot, request if live is None else live.asked(slot.slot, request))
         play.add(turn)
         if watch is not None:
             watch(servo, play.truth, turn)
         ticks += 1
-        if realtime:
+        if live is not None:
+            live.answer(servo.memory.refusal)
+        if realtime or live is not None:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))
     return ticks
+
+
+def _linger(servo: Servo[R, M, F, C], play: Play[R, M, F, C], live: Live, ticks: int) -> None:
+    """Go on for those who look, without the scenario's goals, until a KeyboardInterrupt."""
+    dt, begun = servo.robot.dt, time.monotonic()
+    with suppress(KeyboardInterrupt):
+        for slot in itertools.islice(lockstep(), ticks, None):
+            play.look()
+            servo.turn(slot, live.asked(slot.slot, play.request(servo.memory)))
+            live.answer(servo.memory.refusal)
+            time.sleep(max(0.0, begun + (slot.slot - ticks + 1) * dt - time.monotonic()))

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import commission, experiments, init, logs, offline, operate, plan
+from rtctl.cli import commission, experiments, init, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -38,6 +38,7 @@ def build_parser() -> Parser:
     offline.add_before(commands)
     commission.add(commands)
     operate.add(commands)
+    page.add(commands)
     plan.add(commands)
     offline.add_after(commands)
     experiments.add(commands)

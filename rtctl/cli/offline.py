@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtctl.cli import page
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 from rtctl.plain import Json
@@ -56,6 +57,12 @@ def add_after(commands: Commands) -> None:
     sim.add_argument("--json", action="store_true", help="print one JSON object")
     sim.add_argument("--log", metavar="FILE", default="", help="write an MCAP log")
     sim.add_argument("--realtime", action="store_true", help="no faster than the clock")
+    sim.add_argument(
+        "--view",
+        action="store_true",
+        help="in the browser and in real time; it takes commands, and goes on after its end",
+    )
+    page.add_address(sim)
     sim.add_argument(
         "--allow-miss", action="store_true", help="exit 0 also when a goal was missed or something touched"
     )
@@ -171,7 +178,8 @@ def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.spec.scenario import load_scenario, robot_file
 
     _prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
-    result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime)
+    with page.viewer(arguments) as shown:
+        result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime, shown=shown)
     if arguments.json:
         print(json.dumps(result))
     else:

@@ -77,21 +77,22 @@ class Recorder:
         segment_bytes: int = 1 << 30,
         floor_bytes: int = 256 << 20,
         folders: Sequence[Path] = (),
-        timeout: float = READY_TIMEOUT,
+        config: Path | None = None,
     ) -> "Recorder":
         """Create the ring, start the recorder and wait until it has opened its file.
 
         directory: of the log files; capacity: of the ring [bytes], a power of two; floor_bytes: of free disk that is
-        kept by deleting the oldest logs of the directory; folders: for the ring file, /dev/shm first if not given.
+        kept by deleting the oldest logs of the directory; folders: for the ring file, /dev/shm first if not given;
+        config: the robot's file, for viewers that look for meshes beside it.
         Raises LogError when the recorder does not come up, LinkError when no ring can be had.
         """
         stem = _session_name(Path(directory), header.robot)
         options = Options(Path(directory).absolute(), stem, segment_s, segment_bytes, floor_bytes)
-        blob = json.dumps({"header": header_to_json(header), "options": [str(o) for o in options]}).encode()
+        blob = blob_of(header, [str(o) for o in options], config)
         ring = create(f"{PREFIX}{options.stem}-{os.getpid()}{SUFFIX}", capacity, blob, folders)
         recorder = cls(ring, options)
         recorder.spawn()
-        until = time.monotonic() + timeout
+        until = time.monotonic() + READY_TIMEOUT
         while not ring.counts().ready:
             if not recorder.alive or time.monotonic() > until:
                 recorder._abandon()
@@ -159,6 +160,16 @@ class Recorder:
             self._process.wait()
         self._ring.path.unlink(missing_ok=True)
         self._ring.unmap()
+
+
+def blob_of(header: Header, options: Sequence[str] = (), config: Path | None = None) -> bytes:
+    """Return what a ring tells its consumers: the header, what the recorder is to do, the robot's file."""
+    told = {
+        "header": header_to_json(header),
+        "options": list(options),
+        "config": str(config.resolve()) if config else "",
+    }
+    return json.dumps(told).encode()
 
 
 def _session_name(directory: Path, robot: str) -> str:

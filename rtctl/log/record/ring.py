@@ -97,13 +97,14 @@ class Ring:
     Layout: one page of words, the producer's blob (a JSON header), the data area of a power-of-two size.
     """
 
-    def __init__(self, path: Path, file: int) -> None:
+    def __init__(self, path: Path, file: int, access: int = mmap.ACCESS_WRITE) -> None:
+        """Map the file; access: mmap.ACCESS_WRITE, or ACCESS_READ for somebody who may only look."""
         self.path = path
         self.file = file
         size = os.fstat(file).st_size
         if size < PAGE:
             raise LinkError(f"{path}: not a ring")
-        self.map = mmap.mmap(file, size)
+        self.map = mmap.mmap(file, size, access=access)
         self._page = memoryview(self.map)[:PAGE]
         self.words = self._page.cast("Q")
         self.capacity = self.words[CAPACITY]

@@ -6,6 +6,7 @@ Obstacles are followed by the same rule as the controller's own table: the first
 import base64
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -62,6 +63,16 @@ class Surroundings:
             for each in [n for n in self._things if name in (n, "*") and n not in self._fixed]:
                 self._clear(each)
 
+    def restart(self, known: Sequence[tuple[int, Json]], time: float) -> None:
+        """Take the obstacles that the controller has, each in its slot, for all there are; time [s] of the robot."""
+        for name in list(self._things):
+            self._clear(name)
+        for slot, shape in known:
+            name = str(shape.get("name", ""))
+            if 0 <= slot < len(self._slots) and _is_shape(shape):
+                self._slots[slot] = name
+                self._things[name] = Thing(shape, time, self._boxes_of(shape))
+
     def _set(self, shape: Json, time: float) -> None:
         name = str(shape.get("name", ""))
         if name not in self._things:
@@ -86,6 +97,10 @@ class Surroundings:
     @cached_property
     def _solids(self) -> Meshes:
         return meshes_of(self._header)
+
+    def things(self) -> dict[str, tuple[Thing, bool]]:
+        """Return the obstacles as they were last told, by name, and whether each is the config's own."""
+        return {name: (thing, name in self._fixed) for name, thing in self._things.items()}
 
     def _clear(self, name: str) -> None:
         del self._things[name]
