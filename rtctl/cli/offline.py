@@ -120,6 +120,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if lobby is not None:
             stack.enter_context(lobby)
             print(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", file=sys.stderr, flush=True)
+        _refuse_config(arguments.config)
         _prepare(arguments.config, lobby=lobby)
         from rtctl.app.daemon import run
 
@@ -138,6 +139,16 @@ def _refuse_scenario(config: str) -> None:
     from rtctl.spec.read import refuse_scenario
 
     refuse_scenario(Path(config))
+
+
+def _refuse_config(config: str) -> None:
+    """Refuse a file that contradicts itself before minutes are spent on compiling for it. Raises ConfigError."""
+    from rtctl import design
+
+    if design.is_base(config):
+        design.load_base(config)
+    else:
+        design.load(config)
 
 
 def _lobby(config: str) -> "Lobby | None":
