@@ -4,6 +4,7 @@
 # make lint    ruff, mypy, import floors
 # make bench   the speed figures on this machine
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
+# make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
 # make lock    resolve requirements.lock anew from pyproject.toml
 
@@ -16,7 +17,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench stress mutants install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -37,7 +38,10 @@ bench: install
 	$(BIN)/python -m tools.bench
 
 stress: install
-	$(BIN)/python -m tools.stress
+	$(BIN)/python -m rtctl campaign run tools.stress.source --count 500 --out out/stress
+
+benchmark: install
+	$(BIN)/python -m tools.benchmark --data "$(DATA)" $(BENCHMARK_FLAGS)
 
 mutants: install
 	$(BIN)/python -m tools.mutants
@@ -62,7 +66,7 @@ $(WARM): $(shell find rtctl -name '*.py') | $(INSTALLED)
 
 lock: $(INSTALLED)
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \
-		--strip-extras --allow-unsafe --extra test --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		--strip-extras --allow-unsafe --extra test --extra campaign --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		--output-file requirements.lock pyproject.toml
 
 clean:

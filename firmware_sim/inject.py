@@ -27,6 +27,7 @@ KINDS = {
     "stuck_encoder": "the encoder repeats its last value",
     "false_velocity": "the encoder's speed reads 1 rad/s too high",
     "encoder_jump": "the encoder is off by 0.5 rad",
+    "push": "something pushes a link of the arm: link, newton, direction in the world",
     "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
 }
 FOREVER = 1 << 62
@@ -43,7 +44,9 @@ class Fault(NamedTuple):
     joint: int
     low: float = -180.0  # [deg] of a range sensor's angles, clockwise from the front
     high: float = 180.0
-    value: float = math.nan  # how much, where the kind has a size
+    value: float = math.nan  # how much, where the kind has a size; of a push [N]
+    link: str = ""  # that is pushed at its centre of mass
+    direction: tuple[float, ...] = (0.0, 0.0, 1.0)  # (3,) in the world
 
 
 def _joint(value: Any, names: Sequence[str]) -> int:
@@ -81,7 +84,21 @@ def fault_at(
 
 def faults_of(tables: Iterable[dict[str, Any]], names: Sequence[str]) -> list[Fault]:
     """Return the faults of a scenario's [[fault]] tables."""
-    return [_fault(t["kind"], float(t["at_s"]), t.get("joint"), t.get("duration_s"), names) for t in tables]
+    return [_of_table(t, names) for t in tables]
+
+
+def _of_table(t: dict[str, Any], names: Sequence[str]) -> Fault:
+    fault = _fault(t["kind"], float(t["at_s"]), t.get("joint"), t.get("duration_s"), names)
+    if fault.kind != "push":
+        return fault
+    for key in ("link", "newton"):
+        if t.get(key) is None:
+            raise SettingsError(f"fault: a push wants {key}")
+    direction = tuple(map(float, t.get("direction") or (0.0, 0.0, -1.0)))
+    size = math.sqrt(sum(d * d for d in direction))
+    if size == 0.0:
+        raise SettingsError("fault.direction: got 0 0 0, wanted a direction in the world")
+    return fault._replace(value=float(t["newton"]), link=str(t["link"]), direction=tuple(d / size for d in direction))
 
 
 def parse(text: str, names: Sequence[str]) -> Fault:
@@ -148,6 +165,15 @@ class Injector:
         if self.active("false_velocity", now, joint):
             return q, qd + 1.0
         return (q + JUMP, qd) if self.active("encoder_jump", now, joint) else (q, qd)
+
+    def pushes(self, now: int) -> dict[str, tuple[float, ...]]:
+        """Return the forces [N] in the world on links at time `now` [ns], by the links' names."""
+        found: dict[str, tuple[float, ...]] = {}
+        for f in self.faults:
+            if f.kind == "push" and f.start <= now < f.end:
+                before = found.get(f.link, (0.0, 0.0, 0.0))
+                found[f.link] = tuple(b + f.value * d for b, d in zip(before, f.direction, strict=True))
+        return found
 
     def apply(self, now: int, drives: Sequence[Drive]) -> None:
         """Let the faults that happen inside a drive happen, once each, or for as long as they last where they heat."""

@@ -10,7 +10,7 @@ and contact begins 1 mm early. The same margin rounds the corners of a link's bo
 import os
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,7 @@ class Plant:
         self._inertias(urdf)
         self.time_ns = 0
         self.scene_ns = 0  # time on the scenario's clock: where the obstacles are
+        self.pushed: dict[int, F64] = {}
         self.drag = [-1.0] * len(self.index)
         self.q = [0.0] * len(self.index)
         self.qd = [0.0] * len(self.index)
@@ -175,6 +176,43 @@ class Plant:
         self.q = [s[0] for s in states]
         self.qd = [s[1] for s in states]
 
+    def push(self, forces: Mapping[str, Sequence[float]]) -> None:
+        """Let forces [N] in the world act at the centres of mass of links, until told otherwise. Raises SettingsError.
+
+        The torque J^T f at the joints stands for each.
+        """
+        frames = {name: i for i, name in self.links.items()}
+        for name in forces:
+            if name not in frames:
+                raise SettingsError(f"push: {name} is no link of {self.settings.urdf}")
+        self.pushed = {frames[name]: np.array(f, dtype=np.float64) for name, f in forces.items() if any(f)}
+
+    def _pushed(self) -> F64:
+        """Return the torque (n,) [Nm] of the pushes."""
+        torque = np.zeros(len(self.q))
+        for link, force in self.pushed.items():
+            at = np.array(pb.getLinkState(self.body, link, computeForwardKinematics=1, physicsClientId=self.client)[0])
+            for k, joint in enumerate(self.index):
+                if joint in self._above(link):
+                    axis, origin = self._axis(joint)
+                    torque[k] += np.cross(axis, at - origin) @ force
+        return torque
+
+    def _above(self, link: int) -> set[int]:
+        """Return the joints between a link and the base; pybullet numbers a joint as the link it moves."""
+        found = set()
+        while link >= 0:
+            found.add(link)
+            link = self.parent[link]
+        return found
+
+    def _axis(self, joint: int) -> tuple[F64, F64]:
+        """Return the axis of a revolute joint and a place on it [m], in the world."""
+        state = pb.getLinkState(self.body, joint, physicsClientId=self.client)
+        R = np.array(pb.getMatrixFromQuaternion(state[1])).reshape(3, 3)  # of the frame of inertia
+        axis = np.array(pb.getJointInfo(self.body, joint, physicsClientId=self.client)[13])
+        return R @ axis, np.array(state[4])
+
     def step(self, torque: Sequence[float], drag: Sequence[float]) -> None:
         """Advance one physics step under driven torques [Nm] and bounds on opposing torque [Nm], per joint.
 
@@ -182,6 +220,8 @@ class Plant:
         """
         if not self.joints.ideal:
             torque, drag = self.joints.given(torque, drag)
+        if self.pushed:
+            torque = (np.asarray(torque) + self._pushed()).tolist()
         if self.motors:
             torque = self._with_motors(torque)
         pb.setJointMotorControlArray(

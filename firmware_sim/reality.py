@@ -24,7 +24,7 @@ class Reality(NamedTuple):
     mass_error: dict[str, float]  # link -> fraction added to its mass; '' all others
     inertia_error: dict[str, float]  # the same of its inertia tensor
     urdf_dynamics: bool  # the URDF's own damping and friction act, too
-    coulomb: tuple[float, ...]  # [Nm] friction of a joint that slides
+    coulomb: tuple[float, ...]  # [Nm] friction of a joint that slides; by default as the robot file says
     static: tuple[float, ...]  # [Nm] of one that sticks, at least coulomb
     viscous: tuple[float, ...]  # [Nms/rad] beside the robot file's
     torque_gain: tuple[float, ...]  # of the torque a drive believes to give, what the joint gets
@@ -49,7 +49,7 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
     if unknown:
         raise SettingsError(f"plant.{unknown[0]}: unknown, wanted one of {', '.join(KEYS)}")
     n = len(settings.joints)
-    coulomb = _each(table, "coulomb_Nm", n, 0.0, _within(0.0, 1000.0))
+    coulomb = _each(table, "coulomb_Nm", n, [j.coulomb for j in settings.joints], _within(0.0, 1000.0))
     return Reality(
         payload_kg=_one(table, "payload_kg", 0.0, _within(0.0, 200.0)),
         payload_com=_each(table, "payload_com_m", 3, 0.0, _within(-10.0, 10.0)),

@@ -39,6 +39,7 @@ class JointSetting(NamedTuple):
     q_max: float
     armature: float  # [kg m^2] motor inertia seen at the joint
     friction: float  # [Nms/rad] viscous, seen at the joint
+    coulomb: float  # [Nm]
     direction: float  # 1 or -1: the drive reads direction * q + zero
     zero: float  # [rad]
 
@@ -156,7 +157,8 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
                 float(j["q_min_rad"]),
                 float(j["q_max_rad"]),
                 float(j.get("armature_kg_m2", 0.0)),
-                float(j.get("friction_Nms_rad", 0.0)),
+                float(j.get("friction_Nms_rad", 0.0)) + float(j.get("friction", {}).get("viscous_Nms_rad", 0.0)),
+                float(j.get("friction", {}).get("coulomb_Nm", 0.0)),
                 float(j.get("direction", 1)),
                 float(j.get("zero_rad", 0.0)),
             )

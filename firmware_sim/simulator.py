@@ -71,6 +71,8 @@ class Simulator:
         self._size = frozenset((self.bank.size,))
         self._came, self._replies = Batch(CAPACITY, self.bank.size), Batch(REPLIES, self.bank.size)
         self._steps = 0
+        self._pushes = any(f.kind == "push" for f in injector.faults)
+        self.plant.push({f.link: (0.0, 0.0, 0.0) for f in injector.faults if f.kind == "push"})  # they are links
         self._shown: set[str] = set()
         self._truth: Truth | None = None
         self._sense()
@@ -113,6 +115,8 @@ class Simulator:
         plant, bank = self.plant, self.bank
         if not self.injector.quiet(plant.scene_ns):
             self.injector.apply(plant.scene_ns, self.drives)
+        if self._pushes:
+            plant.push(self.injector.pushes(plant.scene_ns))
         enabled = bank.actuate(plant.step_ns)
         plant.step(bank.torque.tolist(), bank.drag.tolist())
         self.started = self.started or enabled

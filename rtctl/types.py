@@ -42,6 +42,8 @@ class Verb(IntEnum):
     RESET = 4
     RECOVER = 5
     TERM = 6
+    FLOAT = 10  # let a hand move the arm
+    HOLD = 11  # stay here, without a goal
 
 
 class Status(IntEnum):
@@ -58,6 +60,7 @@ class Status(IntEnum):
     UNREACHABLE = 8  # stretched out: the goal is farther than the links are long
     ESCAPING = 9  # circulating around what blocks the way
     BLIND = 10  # a base stands: where it would go has not been seen
+    FLOATING = 11  # a hand moves the arm
 
 
 class Severity(IntEnum):
@@ -165,12 +168,22 @@ class ObstacleEdit(NamedTuple):
     feed: bool = False  # somebody keeps observing it: the observation grows stale even of what rests
 
 
+class Payload(NamedTuple):
+    """What the tip carries, a point in its frame."""
+
+    mass: float  # [kg], 0 nothing
+    x: float = 0.0  # [m] of its centre
+    y: float = 0.0
+    z: float = 0.0
+
+
 class Request(NamedTuple):
     """Everything that reaches the tick from operators and sensors in one slot."""
 
     verb: Verb = Verb.NONE
     goal: Goal | None = None
     obstacles: tuple[ObstacleEdit, ...] = ()
+    payload: Payload | None = None
 
 
 class Feedback(NamedTuple):

@@ -47,6 +47,8 @@ DEMANDED = {
     "overspeed": (Severity.SS1, "R"),
     "innovation": (Severity.SS1, "R"),
     "log_degraded": (Severity.LOG, "A"),
+    "collision": (Severity.SS2, "R"),
+    "collision_hard": (Severity.SS1, "R"),
 }
 
 
@@ -129,6 +131,19 @@ def creeping(speed: float, pause: int, ticks: int) -> Callable[[Arm], list[dict[
     ]
 
 
+def pushed(acceleration: float) -> Callable[[Arm], list[dict[str, Any]]]:
+    """Something accelerates the second joint [rad/s2] of an arm that has held itself for a while, for 30 ms."""
+
+    def slots(arm: Arm) -> list[dict[str, Any]]:
+        times = 1e-3 * np.arange(1, 31)
+        moves = [
+            {"q": arm.q + joint(1, 0.5 * acceleration * t**2), "qd": joint(1, acceleration * t)} for t in times.tolist()
+        ]
+        return [*[{}] * 520, *moves]
+
+    return slots
+
+
 CASES = {
     "feedback_stale": Case(said(age_of(4)), said(age_of(3))),
     "feedback_lost": Case(said(age_of(11)), said(age_of(10))),
@@ -161,15 +176,18 @@ CASES = {
     "overspeed": Case(said({"qd": joint(0, 2.175 * 1.25)}), said({"qd": joint(0, 2.175 * 1.15)})),
     "innovation": Case(drifts(0.003, 30), jumps(*[2e-4, -2e-4] * 20)),
     "log_degraded": Case(flag(Link.LOG_DEGRADED)),
+    "collision": Case(pushed(15.0), pushed(3.0), alone=True),
+    "collision_hard": Case(pushed(40.0), alone=True),
 }
 
 
 @cache
 def unjudged() -> Robot:
-    """Return the robot without a bound on what measurement and estimate may differ by."""
+    """Return the robot without a bound on what measurement and estimate may differ by, and easily touched."""
     arm = robot()
     loose = arm.safety._replace(innovation_max=np.inf, velocity_tolerance=np.full(arm.n, np.inf))
-    return prepared(arm._replace(safety=loose))
+    touchy, struck = 0.02 * arm.tau_rated, 0.2 * arm.tau_rated
+    return prepared(arm._replace(safety=loose, collision=touchy, collision_hard=struck))
 
 
 def produced(name: str, arm: Arm) -> bool:

@@ -40,7 +40,18 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
         model,
         space,
         table,
-        law.Motion(q, np.zeros(7), osc.Twist(ZERO, ZERO), osc.Twist(e, ZERO), osc.Twist(e, ZERO), q, 1.0, np.zeros(7)),
+        law.Motion(
+            q,
+            np.zeros(7),
+            osc.Twist(ZERO, ZERO),
+            osc.Twist(e, ZERO),
+            osc.Twist(e, ZERO),
+            q,
+            1.0,
+            np.zeros(7),
+            False,
+            np.zeros(7),
+        ),
     )
 
 

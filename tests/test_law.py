@@ -54,7 +54,7 @@ def law_at(q: F64, qd: F64 | None = None, balls: tuple[tuple[float, ...], ...] =
     obstacles = changes.pop("obstacles", space_of(balls))
     still = Twist(ZERO, ZERO)
     error, previous = Twist(changes.pop("e", ZERO), ZERO), Twist(changes.pop("v_ref", ZERO), ZERO)
-    motion = Motion(q, qd, Twist(twist[:3], twist[3:]), still, still, q, 1.0, np.zeros(7))
+    motion = Motion(q, qd, Twist(twist[:3], twist[3:]), still, still, q, 1.0, np.zeros(7), False, np.zeros(7))
     return evaluate_law(arm, model, space, obstacles, motion._replace(error=error, previous=previous, **changes))
 
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from firmware_sim.plant import Contact
+from rtctl.campaign.case import Asked, Scene
+from rtctl.campaign.scenes import scenario_of, toml_of
 from rtctl.spec.scenario import load_scenario, scenario_dict
 from tests.lab import robot
 from tools.stress import judge
-from tools.stress.play import Seen, play, robot_of
-from tools.stress.scene import scenario_of, toml_of
+from tools.stress.play import CONFIGS, Seen, play, robot_of
+from tools.stress.source import columns, source
 
 BRIEF = 2.0  # [s] that is played here of each
 
@@ -24,6 +26,7 @@ def seen(**changes: Any) -> Seen:
         "duration": 5.0,
         "arrived": True,
         "error": 0.0,
+        "time_to_goal": 1.0,
         "contact": None,
         "retreat": 0.0,
         "can_retreat": 0.0,
@@ -163,3 +166,14 @@ def test_what_appears_within_the_clearance_of_a_running_arm_makes_nothing_too_fa
     assert max(run.torque, run.joint_speed) <= 1.0
     assert run.tip_speed <= 1.0 + judge.TIP_TOLERANCE
     assert run.rate <= 1.0 + 1e-9
+
+
+def test_a_run_of_the_campaign_is_the_run_itself():
+    case = next(source.cases(Asked(("planar4",), range(1), 1, {})))
+    path = CONFIGS / "planar4.toml"
+    table = scenario_of(*robot_of("planar4"), 0, 0) | {"duration_s": 1.0}
+    row = source.play(case, Scene(table, path), path)
+    run = play(table, 0)
+    assert (row["digest"], row["failures"], row["min_clearance_m"]) == (run.digest, "", run.clearance)
+    late = columns(run, ["torque at 1.2"])
+    assert late["failures"] == "torque at 1.2"

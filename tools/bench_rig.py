@@ -210,6 +210,8 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         robot.q_rest,
         1.0,
         np.zeros(robot.n),
+        False,
+        np.zeros(robot.n),
     )
     return Case(small, model, space, obstacles, motion)
 
@@ -260,7 +262,7 @@ class BoundFloor:
     def __init__(self, library: ctypes.CDLL, case: Case) -> None:
         self._library = library
         r, model, space, obstacles, motion = case
-        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd = motion
+        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd, _, _ = motion
         p, a, b = r.motion, r.avoid, r.limit
         self._arrays = [
             np.ascontiguousarray(each, np.float64)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -55,8 +56,10 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
     if timeout is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, handshake_s=timeout))
 
+    build = cache(lambda: cfg.build(config, path))  # takes seconds; a robot is constant
+
     def simulate(scenario: Scenario, source: Path) -> ArmPlay:
-        robot = scenario_robot(cfg.build(config, path), scenario, source)
+        robot = scenario_robot(build(), scenario, source)
         simulator = open_simulator(path, scenario, source)
         return ArmPlay(robot, scenario, simulator, ArmLink(link_spec(config), InProcess.of(simulator)))
 
@@ -67,7 +70,7 @@ def load(path: Path, timeout: float | None = None) -> Setup[Robot, Memory, Feedb
         log=config.log,
         resource=(bus_resource(config.link.interface, config.link.channel), "link.channel"),
         place=f"{config.link.interface}:{config.link.channel}",
-        build=lambda: cfg.build(config, path),
+        build=build,
         open=lambda: open_link(config, path),
         header=lambda robot, start, link: header_of(config, path, robot, start.q, counters=link.counters),
         simulate=simulate,
@@ -81,9 +84,16 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("rejected", after.refusal))
     fresh = after.in_force & ~before.in_force
     if fresh:
-        found.append(("fault", faults.describe(fresh, feedback, robot.joints, after.state)))
+        found.append(
+            ("fault", faults.describe(fresh, feedback, robot.joints, after.state, robot.links[after.contact_link]))
+        )
     if after.state != before.state:
         found.append(("state", after.state.name))
+    if not np.array_equal(after.payload, before.payload):
+        mass, x, y, z = after.payload
+        found.append(("payload", f"{mass:g} kg at {x:g} {y:g} {z:g} m of the tip" if mass > 0.0 else "none"))
+    if before.floating and not after.floating:
+        found.append(("hold", "no hand guides the arm any more"))
     if (after.status, after.blockers) != (before.status, before.blockers) and after.status != Status.NO_GOAL:
         found.append((after.status.name.lower(), "; ".join(after.blocked_by)))
     return found
@@ -111,6 +121,8 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
         "error_m": error,
         "error_rad": error_rot,
         "clearance_m": clearances(m),
+        "payload": dict(zip(("mass_kg", "com_m"), (float(m.payload[0]), m.payload[1:]), strict=True)),
+        "untold_Nm": m.lasting if m.noticed else np.zeros(robot.n),
         "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
     }
 

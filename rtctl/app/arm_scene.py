@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from rtctl.app.stream import ArmStatus, GoalStream
-from rtctl.app.tally import Leg, number, of_way
+from rtctl.app.tally import Leg, kept, number, of_way
 from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
 from rtctl.arm.memory import Memory
@@ -183,6 +183,11 @@ class ArmPlay:
         self.tally = ArmTally(robot)
         self.feed = ArmFeed(robot, scenario, simulator, self.tally)
         self.truth: Truth = simulator.truth()
+
+    @property
+    def kept(self) -> float:
+        """How long [s] the last of all goals has been kept, 0 before."""
+        return kept(self.tally.legs, len(self.feed.pending), self.truth.time)
 
     def look(self) -> float:
         """Take the truth of now; return the scenario's time [s]."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from rtctl.app.rover_link import RoverLink, open_link
 from rtctl.app.simulator import open_simulator
-from rtctl.app.tally import Leg, number, of_way
+from rtctl.app.tally import Leg, kept, number, of_way
 from rtctl.app.vehicle import Said, Turn
 from rtctl.errors import ConfigError
 from rtctl.hal.mavlink.wire import InProcess
@@ -126,6 +126,11 @@ class RoverPlay:
         self.tally = RoverTally()
         self.feed = RoverFeed(base, scenario, self.tally)
         self.truth: RoverTruth = rover.truth()
+
+    @property
+    def kept(self) -> float:
+        """How long [s] the last of all goals has been kept, 0 before."""
+        return kept(self.tally.legs, len(self.feed.pending), self.truth.time)
 
     def look(self) -> float:
         """Take the truth of now; return the scenario's time [s]."""

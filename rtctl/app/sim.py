@@ -15,12 +15,13 @@ from rtctl.app.choose import vehicle_of
 from rtctl.app.live import Live
 from rtctl.app.servo import Servo
 from rtctl.app.tally import number
-from rtctl.app.vehicle import C, F, M, Play, R, Sink, Turn
+from rtctl.app.vehicle import C, F, M, Play, R, Setup, Sink, Turn, Vehicle
 from rtctl.hal.clock import lockstep
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
 
 Watch: TypeAlias = Callable[[Any, Any, Any], None]  # is shown servo, truth and turn of the vehicle after each period
+Over: TypeAlias = Callable[[Any, float], bool]  # truth, and how long [s] the last goal has been kept
 
 
 def simulate(
@@ -81,6 +82,22 @@ def simulate_scenario(
     return found
 
 
+def simulate_setup(
+    vehicle: Vehicle[R, M, F, C],
+    setup: Setup[R, M, F, C],
+    scenario: Scenario,
+    source: Path,
+    watch: Watch | None = None,
+    over: Over | None = None,
+) -> Json:
+    """Return the figures of a scenario for a robot file already read; `over` ends the run before its time."""
+    play = setup.simulate(scenario, source)
+    with closing(play.link):
+        servo = Servo(vehicle, play.robot, play.link, None, play.link.greet(True))
+        begun, ticks = time.perf_counter(), _played(servo, scenario, play, False, watch, None, over)
+        return _figures(servo, play, ticks, time.perf_counter() - begun)
+
+
 def _figures(servo: Servo[R, M, F, C], play: Play[R, M, F, C], ticks: int, elapsed: float) -> Json:
     vehicle, robot = servo.vehicle, servo.robot
     return {
@@ -116,12 +133,15 @@ def _played(
     realtime: bool,
     watch: Watch | None,
     live: Live | None,
+    over: Over | None = None,
 ) -> int:
     """Run the servo in lockstep until the scenario is over; return the ticks it took."""
     dt, begun = servo.robot.dt, time.monotonic()
     ticks = 0
     for slot in lockstep():
         if play.look() >= scenario.duration_s or slot.slot * dt > scenario.duration_s + play.arm_time:
+            break
+        if over is not None and over(play.truth, play.kept):
             break
         request = play.request(servo.memory)
         turn: Turn[F, C] = servo.turn(slot, request if live is None else live.asked(slot.slot, request))

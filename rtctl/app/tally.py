@@ -35,6 +35,11 @@ class Leg(NamedTuple):
         return self._replace(reached=reached, deviation=deviation, error=error, error_rot=error_rot)
 
 
+def kept(legs: Sequence[Leg], to_come: int, now: float) -> float:
+    """Return how long [s] the last of all goals has been kept, 0 while it is not or others are to come."""
+    return 0.0 if to_come or not legs or legs[-1].reached < 0.0 else now - legs[-1].reached
+
+
 def number(value: float) -> float | None:
     """Return a figure to nine digits; JSON has no infinity."""
     return float(f"{value:.9g}") if np.isfinite(value) else None

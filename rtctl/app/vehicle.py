@@ -157,6 +157,8 @@ class Play(Protocol[R_co, M_contra, F, C]):
     def arm_time(self) -> float: ...  # [s] beside the scenario's own, within which the vehicle must be running
     @property
     def truth(self) -> object: ...  # the simulator's own account of the last period
+    @property
+    def kept(self) -> float: ...  # [s] that the last of all goals has been kept, 0 before
 
     def look(self) -> float: ...  # take the truth of now; the scenario's time [s]
     def request(self, memory: M_contra) -> Request: ...

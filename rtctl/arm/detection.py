@@ -23,7 +23,9 @@ from rtctl.types import B1, F64, Feedback
     STIRS,  # a joint is not at rest
     CONTACT,  # an obstacle within a point of the arm
     GOAL_INSIDE,  # an obstacle around the goal's position
-) = (1 << i for i in range(13))
+    TOUCHED,  # an external torque that nothing told explains
+    STRUCK,  # the same, and large
+) = (1 << i for i in range(15))
 
 
 class Clearances(NamedTuple):

@@ -91,12 +91,30 @@ def rounding(A: F64, qd_noise: F64, least: F64) -> F64:
     A (n, n) [kg m2]; qd_noise (n,) [rad/s] standard deviation, that of a step is step/sqrt(12); least (n,) [Nm]: what
     torques and the age of the model make of nothing.
     """
+    out = spread(A, qd_noise, LASTING)
+    for i in range(out.shape[0]):
+        out[i] = least[i] + out[i]
+    return out
+
+
+@kernel
+def spread(A: F64, qd_noise: F64, bandwidth: float) -> F64:
+    """Return the torque (n,) [Nm] that one step of speed at all joints is, seen at a bandwidth [1/s]; as `rounding`."""
     out = np.empty(qd_noise.shape[0])
     for i in range(out.shape[0]):
         s = 0.0
         for k in range(out.shape[0]):
             s += 12.0 * (A[i, k] * qd_noise[k]) ** 2
-        out[i] = least[i] + LASTING * math.sqrt(s)
+        out[i] = bandwidth * math.sqrt(s)
+    return out
+
+
+@kernel
+def within(torque: F64, bound: F64) -> F64:
+    """Return a torque (n,) [Nm] cut to +-bound (n,) [Nm]."""
+    out = np.empty(bound.shape[0])
+    for i in range(bound.shape[0]):
+        out[i] = min(max(torque[i], -bound[i]), bound[i])
     return out
 
 

@@ -84,6 +84,8 @@ FAULTS = (
         ("position", "speed", "torque"),
     ),
     Fault("log_degraded", 51, Severity.LOG, "A", "the log cannot be written; arming is refused"),
+    Fault("collision", 24, Severity.SS2, "R", "something pushes the arm that nobody told of"),
+    Fault("collision_hard", 24, Severity.SS1, "R", "something struck the arm"),
 )
 TABLE = FaultTable.of(FAULTS)
 BIT, names, severity = TABLE.bit, TABLE.names, TABLE.severity
@@ -139,6 +141,8 @@ class _Bits(NamedTuple):
     outside_limits: int = BIT["outside_limits"]
     overspeed: int = BIT["overspeed"]
     innovation: int = BIT["innovation"]
+    collision: int = BIT["collision"]
+    collision_hard: int = BIT["collision_hard"]
 
 
 _B = _Bits()
@@ -288,15 +292,19 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
         bits |= _B.overspeed
     if n.innovation >= 5:
         bits |= _B.innovation
+    if active and flags & (detection.TOUCHED | detection.STRUCK):
+        bits |= _B.collision_hard if flags & detection.STRUCK else _B.collision
     for flag, bit in _BY_LINK:
         if link & flag:
             bits |= bit
     return bits
 
 
-def describe(bits: int, feedback: Feedback, joints: tuple[str, ...], state: State) -> str:
-    """Return one line that names each fault and, for drive faults, the joint and its code."""
-    if not bits & BIT["drive_fault"]:
-        return TABLE.describe(bits, state)
-    codes = [f"{joints[i]}: {FAULT_CODES.get(int(d), hex(int(d)))}" for i, d in enumerate(feedback.drive) if d > 1]
-    return TABLE.describe(bits, state, {"drive_fault": f" ({', '.join(codes) or 'cleared since'})"})
+def describe(bits: int, feedback: Feedback, joints: tuple[str, ...], state: State, link: str = "") -> str:
+    """Return one line that names each fault: for drive faults the joint and its code, for contacts the link."""
+    at = f" at {link}" if link else ""
+    details = {"collision": at, "collision_hard": at}
+    if bits & BIT["drive_fault"]:
+        codes = [f"{joints[i]}: {FAULT_CODES.get(int(d), hex(int(d)))}" for i, d in enumerate(feedback.drive) if d > 1]
+        details["drive_fault"] = f" ({', '.join(codes) or 'cleared since'})"
+    return TABLE.describe(bits, state, details)

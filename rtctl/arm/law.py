@@ -51,7 +51,8 @@ _SCALED = int(LimitFlag.MOTION_SCALED)
 REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
 _BARE = (  # of Robot
     "q_min", "q_max", "qd_max", "tau_max", "tau_rate", "tau_lsb", "braking", "viscous", "q_rest", "dt", "model_dt",
-    "carry", "escape", "payload_max", "friction_max", "noticeable", "tolerance", "tolerance_rot",
+    "carry", "escape", "payload_max", "friction_max", "noticeable", "tolerance", "tolerance_rot", "coulomb",
+    "viscous_told", "collision", "collision_hard",
 )  # fmt: skip
 
 # rows of Law.torques, (7, n) [Nm]; the first five as the record has them
@@ -146,6 +147,8 @@ class Motion(NamedTuple):
     q_rest: F64  # (n,) [rad] the posture
     speed_scale: float  # fraction of qd_max that joints may have
     qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
+    floats: bool  # a hand moves the arm: no motion, no posture
+    hand: F64  # (n,) [Nm] then
 
 
 def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles: Obstacles, motion: Motion) -> Law:
@@ -381,6 +384,10 @@ def _torques(
     )
     at = TaskDynamics(model.J, model.Jdqd, model.A, space.Lambda, space.NT)
     motion_torque(at, motion.actual, reference, q, qd, motion.q_rest, p.motion, task[:6], w)
+    if motion.floats:
+        for i in range(n):
+            w[TASK_DRIVE, i], w[TASK_BRAKE, i] = motion.hand[i], 0.0
+            w[POSTURE_SPRING, i], w[POSTURE_DAMPER, i] = 0.0, 0.0
     for i in range(n):
         w[_DQ, i], w[_DIAGONAL, i], w[_LOAD, i] = q[i] - model.q[i], model.A[i, i], model.g[i] + model.h[i]
     dq, load, tau_max = w[_DQ], w[_LOAD], limits.tau_max

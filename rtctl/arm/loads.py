@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from rtctl.arm.collision import watch_contact
 from rtctl.arm.disturbance import (
     FOLLOWING,
     RESTING,
@@ -17,7 +18,9 @@ from rtctl.arm.disturbance import (
     rounding,
     settled,
     slow_part,
+    within,
 )
+from rtctl.arm.friction import GUIDED, rubbing, sliding, speeds_of
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import drives_torque
 from rtctl.arm.target import target_of
@@ -39,23 +42,27 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     qd = f.qd.copy()
     if not drives_torque(m) or m.state == _ARMED:  # brakes may hold it: nothing is to be learnt
         m.external[:n], m.lasting[:n], m.external_moving[:n], m.qd_measured[:n] = 0.0, 0.0, 0.0, qd
-        m.noticed, m.settled = 0, 0
+        m.noticed, m.settled, m.touches, m.contact_level = 0, 0, 0, 0
+        m.track[:n], m.unsure[:n], m.expected[:n], m.steady[:n] = 0.0, 0.0, 0.0, 0.0
         return
     load, resting = np.empty(n), True
     for i in range(n):
         if not (f.replies[i] > 0 and np.isfinite(qd[i])):
             qd[i] = m.qd_measured[i]
-        load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i]
+        load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i] + c.coulomb[i] * sliding(m.qd[i])
         resting = resting and abs(qd[i]) < RESTING
     # the speed measured now ends the period in which the command before the last one was applied
     before, tau = m.qd_measured[:n].copy(), m.sent[1, :n].copy()
     external = observed(m.external[:n].copy(), model.A, qd, before, load, tau, elapsed)
     m.external[:n], m.qd_measured[:n] = external, qd
+    watch_contact(c, m, qd, model, elapsed)
     if m.state != _RUN:
         return  # a stop goes on with what was known
-    m.settled = 1 if settled(m.settled != 0, resting, _error(c, m)) else 0
-    if m.settled == 0 or m.noticed == 0:
-        bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
+    m.settled = 1 if m.floating == 0 and settled(m.settled != 0, resting, _error(c, m)) else 0
+    bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
+    if m.floating != 0:  # what a hand does is not learnt: the weight found before, where the tip is now
+        m.lasting[:n] = within(m.float_weight * model.J[2] + m.float_rest[:n], bound)
+    elif m.settled == 0 or m.noticed == 0:
         m.lasting[:n] = slow_part(m.lasting[:n].copy(), external, bound, elapsed)
     least = c.noticeable[:n].copy()
     if m.noticed == 0 and beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least)):
@@ -75,6 +82,23 @@ def _error(c: RecordRow, m: RecordRow) -> float:
     near = max(target.tolerance if target.tolerance > 0.0 else c.tolerance, FINE)
     near_rot = max(target.tolerance_rot if target.tolerance_rot > 0.0 else c.tolerance_rot, FINE_ROT)
     return max(norm(e) / near, norm(e_rot) / near_rot)
+
+
+@kernel
+def pushed(c: RecordRow, m: RecordRow, Jbar: F64, n: int) -> tuple[F64, F64]:
+    """Return what the law carries as if it were gravity, and what a hand does to an arm that floats, (n,) [Nm].
+
+    Carried is what lasts, and known friction. An arm that floats is taken to be held by all that is external to it and
+    driven by the hand: where no guard acts one is the other, and the hand moves the arm; where one acts it gives
+    against the hand what keeps the bound.
+    """
+    lasting = m.lasting[:n].copy() if m.noticed != 0 else np.zeros(n)
+    coulomb, viscous = c.coulomb[:n].copy(), c.viscous_told[:n].copy()
+    if m.floating != 0:
+        external = m.external[:n].copy()
+        return external - GUIDED * rubbing(coulomb, viscous, m.qd[:n].copy()), external - lasting
+    asked = speeds_of(Jbar, m.v_ref.copy(), m.w_ref.copy())
+    return lasting - rubbing(coulomb, viscous, asked), np.zeros(n)
 
 
 @kernel

@@ -110,6 +110,21 @@ HOT = np.dtype(
             ("settled", _INT),  # and stays as it is: the arm is at rest where it shall be
             ("qd_measured", _REAL, _JOINT),  # [rad/s] of the last feedback
             ("external_moving", _REAL, _JOINT),  # [Nm] as slow, hardly following where an encoder stands still
+            ("payload", _REAL, (4,)),  # [kg] and its centre [m] in the tip's frame, as told
+            # contact; see `collision`
+            ("track", _REAL, _JOINT),  # [Nm] the part of `external` that is none
+            ("unsure", _REAL, _JOINT),  # [Nm] that a payload may be accelerated with
+            ("expected", _REAL, _JOINT),  # [Nm] of a payload that was told and may be taken up now
+            ("steady", _REAL, _JOINT),  # [s] for which each joint has not been slow
+            ("v_before", _REAL, (3,)),  # [m/s] v_ref of the tick before
+            ("w_before", _REAL, (3,)),  # [rad/s]
+            ("touches", _INT),  # ticks for which a contact has been seen
+            ("contact_level", _INT),  # of this tick: none, touched, struck
+            ("contact_link", _INT),  # of the last contact, numbered as the model does
+            # a hand guides the arm
+            ("floating", _INT),
+            ("float_weight", _REAL),  # [N] at the tip
+            ("float_rest", _REAL, _JOINT),  # [Nm] that lasted beside it
         ],
     )
 )
@@ -126,6 +141,11 @@ _JOINTS = (
     "lasting",
     "qd_measured",
     "external_moving",
+    "track",
+    "unsure",
+    "expected",
+    "steady",
+    "float_rest",
 )
 _FLAGS = (
     "off",
@@ -137,6 +157,7 @@ _FLAGS = (
     "slew_follows_echo",
     "noticed",
     "settled",
+    "floating",
 )
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 

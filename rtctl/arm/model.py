@@ -311,6 +311,15 @@ class RigidBody:
         return len(self.names)
 
     @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links: what each joint carries, by the first body that the URDF fixes to it."""
+        bodies: dict[int, str] = {}
+        for frame in self.model.frames:
+            if frame.type == pin.FrameType.BODY:
+                bodies.setdefault(int(frame.parentJoint), frame.name)
+        return tuple(bodies.get(int(j), "base") for j in self.skeleton.joint)
+
+    @property
     def limits(self) -> JointLimits:
         """Joint limits from the URDF; a continuous joint has none."""
         model = self.model

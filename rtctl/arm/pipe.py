@@ -14,6 +14,7 @@ from rtctl.arm.flat import parameters_of, shapes_of, table_of
 from rtctl.arm.law import REVIEW
 from rtctl.arm.memory import Memory, fresh, record_of
 from rtctl.arm.model import Model
+from rtctl.arm.payload import with_payload
 from rtctl.arm.record import record_dtype
 from rtctl.arm.robot import Robot
 from rtctl.arm.servo_level import (
@@ -63,7 +64,8 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     feedback: the drives' replies of this slot; request: what operators and sensors sent since the previous tick.
     """
     f = feedback if type(feedback.link) is int else feedback._replace(link=int(feedback.link))
-    bits, verb, m = REQUEST if request.verb or request.goal is not None else 0, int(request.verb), memory
+    asked = request.verb or request.goal is not None or request.payload is not None
+    bits, verb, m = REQUEST if asked else 0, int(request.verb), memory
     blocked_by, refusal = memory.blocked_by, ""
     if request.obstacles:
         m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
@@ -79,6 +81,7 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
         m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes)
         m, chosen = _decided(robot, m, feedback, request)
         hot, table, blocked_by, refusal = m.hot, m.table, m.blocked_by, m.refusal
+        model, parameters = m.model, m.parameters
         hot, table, raw, flags = servo(
             arm, hot, parameters, table, shapes, bodies, f, asking(DECIDED, bits | chosen, verb)
         )
@@ -129,7 +132,7 @@ def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
     """Return the model at the joints of a hot record if one is due, and the parameters of its task."""
     h, n = record_of(hot)[0], robot.n
     if h["evaluated"]:
-        model = robot.body.evaluate(h["q"][:n], h["qd"][:n], robot.points, robot.own)
+        model = robot.body.evaluate(h["q"][:n], h["qd"][:n], robot.points, robot.own, h["payload"].tolist())
     return model, parameters_of(model, int(h["task"]), h["axis"], robot.motion)
 
 
@@ -142,7 +145,7 @@ def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) ->
 
 def _decided(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> tuple[Memory, int]:
     """Return the memory after what is rare: the supervisor's events, a new goal, the side of an escape (CHOSEN)."""
-    m = supervise(robot, m, feedback, request, m.present)
+    m = supervise(robot, with_payload(robot, m, request), feedback, request, m.present)
     m = with_goal(robot, m, request)
     if pursues(record_of(m.hot)[0]) and m.escape.phase == escape.Phase.CHOOSING:
         return _with_side(robot, m), CHOSEN

@@ -43,6 +43,7 @@ class Robot(NamedTuple):
     name: str
     n: int
     joints: tuple[str, ...]
+    links: tuple[str, ...]  # (n + 1) 0 the base, i what joint i-1 carries
     slots: int  # obstacle slots K
     dt: float  # [s] servo period
     model_dt: float  # [s] period of the parameter evaluation, >= dt
@@ -56,7 +57,11 @@ class Robot(NamedTuple):
     payload_max: float  # [kg] at the tip, that is carried untold
     friction_max: F64  # (n,) [Nm] the same of friction, and of what the drives are wrong by
     noticeable: F64  # (n,) [Nm] more than this of an external torque is more than rounding
-    viscous: F64  # (n,) [Nms/rad] friction of the joints, for predictions alone: it damps, so it is not compensated
+    viscous: F64  # (n,) [Nms/rad] friction of the joints, all of it: what predictions count with
+    viscous_told: F64  # (n,) [Nms/rad] of it what is given beforehand; the rest damps
+    coulomb: F64  # (n,) [Nm] friction that is given beforehand
+    collision: F64  # (n,) [Nm] a fast external torque beyond it, and what may explain it, is a contact
+    collision_hard: F64  # (n,) [Nm] the same of one after which the arm is not driven any more
     braking: F64  # (n,) [rad/s2] with which a joint is brought to rest before its limit
     home: F64  # (n,) [rad]
     q_rest: F64  # (n,) [rad] of the posture task

@@ -11,7 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.detection import BEYOND, STIRS, Clearances, JointBounds, Tolerances, encoder_flags, examine_feedback
+from rtctl.arm.detection import (
+    BEYOND,
+    STIRS,
+    STRUCK,
+    TOUCHED,
+    Clearances,
+    JointBounds,
+    Tolerances,
+    encoder_flags,
+    examine_feedback,
+)
 from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions
 from rtctl.arm.estimator import (
     EstimatorParams,
@@ -196,6 +206,7 @@ def detect_faults(
     if active:
         monitors, more = _monitored(c, m, f, model)
         flags |= more
+    flags |= STRUCK if m.contact_level > 1 else TOUCHED if m.contact_level == 1 else 0
     evidence = Evidence(
         flags,
         found.age,

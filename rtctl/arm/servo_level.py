@@ -13,9 +13,10 @@ import numpy as np
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
+from rtctl.arm.friction import rubbing
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
-from rtctl.arm.loads import loaded, observe
+from rtctl.arm.loads import loaded, observe, pushed
 from rtctl.arm.memory import HOT
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
@@ -180,7 +181,9 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
     m.qdd[:n] = 0.0
     if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
         viscous, g = c.viscous[:n].copy(), model.g - m.external[:n] if noticed else model.g
-        m.qdd[:n] = acceleration(model.A_inv, tau, model.h, g, viscous, qd)
+        m.qdd[:n] = acceleration(
+            model.A_inv, tau, model.h, g + rubbing(c.coulomb[:n].copy(), np.zeros(n), qd), viscous, qd
+        )
     m.limit_flags, m.slew_follows_echo = limited.flags | m.limit_flags, 1 if follows else 0
     return command, limited.tau_wanted
 
@@ -193,8 +196,8 @@ def _act(
     c, n = arm.constants[0], f.q.shape[0]
     e, e_rot, q_rest = wanted(c, m, model, asked.bits & CHOSEN != 0)
     q, qd, x, R, xd, omega = m.q[:n].copy(), m.qd[:n].copy(), m.x.copy(), m.R.copy(), m.xd.copy(), m.omega.copy()
-    lasting = m.lasting[:n].copy() if m.noticed != 0 else np.zeros(n)
-    at = loaded(model, lasting, q if c.carry == 0.0 else model.q)  # without carrying, points have not moved either
+    carried, hand = pushed(c, m, space.Jbar, n)
+    at = loaded(model, carried, q if c.carry == 0.0 else model.q)  # without carrying, points have not moved either
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
     _, m.limit_flags = law(
@@ -213,6 +216,8 @@ def _act(
             q_rest,
             m.speed_scale,
             m.qdd[:n].copy(),
+            m.floating != 0,
+            hand,
         ),
         WorkMemory(arm.reals, arm.wholes),
         out,

@@ -19,6 +19,7 @@ CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
 CLEARING = "drive faults are being cleared now: reset again"
 OUTSIDE = "a joint is beyond its limits: move it back by hand, or use recover"
 INSIDE = "no joint is beyond its limits, there is nothing to recover from: use arm"
+LEVER = 0.05  # [m] of all joints together, below which a weight at the tip cannot be felt
 RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {})
 
 
@@ -26,6 +27,8 @@ def supervise(robot: Robot, m: Memory, feedback: Feedback, request: Request, pre
     """Return the memory after the supervisor's table took this tick's events."""
     if m.state == State.RUN and request.verb == Verb.NONE and faults.TABLE.stops(m.in_force) < Severity.SS2:
         return m  # what RUN is left for is asked, or a fault
+    if request.verb in (Verb.FLOAT, Verb.HOLD):
+        m, request = _guided(robot, m, request.verb), request._replace(verb=Verb.NONE)
     verb, before = request.verb, m.state
     clearing = verb == Verb.RESET and supervisor.admits(before, verb) and bool(present & BIT["drive_fault"])
     if verb == Verb.ARM and m.outside:
@@ -67,6 +70,25 @@ def _timed(robot: Robot, m: Memory, enabled: bool) -> frozenset[Event]:
     return frozenset()
 
 
+def _guided(robot: Robot, m: Memory, verb: Verb) -> Memory:
+    """Return the memory of an arm that a hand may move from now on, or that holds itself where it is."""
+    refusal = f"not possible in state {m.state.name}" if m.state != State.RUN else ""
+    if verb == Verb.FLOAT and not refusal and m.outside:
+        refusal = "a joint is still beyond its limits"
+    if refusal:
+        return m._replace(refusal=f"{verb.name.lower()}: {refusal}")
+    m = held_here(robot, free_of_goals(m))
+    if verb == Verb.HOLD:
+        return m._replace(floating=False)
+    # of what lasts, the weight at the tip goes with it; without `noticed` the hand would surprise the filters
+    up, lasting = m.model.J[2], m.lasting if m.noticed else np.zeros(robot.n)
+    size = float(up @ up)
+    weight = float(up @ lasting) / size if size > LEVER**2 else 0.0
+    return m._replace(
+        floating=True, noticed=True, lasting=lasting, float_weight=weight, float_rest=lasting - weight * up
+    )
+
+
 def _entered(robot: Robot, m: Memory) -> Memory:
     """Return the memory on entering a state: every motion begins from what is measured now."""
     m = free_of_goals(m)._replace(off=False, onset=m.joints.qd, onset_faults=m.present)
@@ -104,7 +126,7 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
     refusal = refusal or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
     if refusal:
         return m._replace(refusal=refusal)
-    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING)
+    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, floating=False)
 
 
 def free_of_goals(m: Memory) -> Memory:

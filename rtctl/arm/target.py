@@ -29,8 +29,8 @@ SAME, DIAGNOSE, WORDS = 0, 4, 8  # nothing; a diagnosis; other words, for what b
 # numbers of the enumerations, as compiled code reads them
 _ARMED, _RUN, _STOPPING, _SAFE_STOP = (int(s) for s in (State.ARMED, State.RUN, State.STOPPING, State.SAFE_STOP))
 _NONE, _CHOOSING, _FIRST, _OTHER = (int(p) for p in (Phase.NONE, Phase.CHOOSING, Phase.FIRST, Phase.OTHER))
-_NO_GOAL, _MOVING, _ARRIVED, _ESCAPING = (
-    int(s) for s in (Status.NO_GOAL, Status.MOVING, Status.ARRIVED, Status.ESCAPING)
+_NO_GOAL, _MOVING, _ARRIVED, _ESCAPING, _FLOATING = (
+    int(s) for s in (Status.NO_GOAL, Status.MOVING, Status.ARRIVED, Status.ESCAPING, Status.FLOATING)
 )
 
 
@@ -139,7 +139,10 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
         START_SPEED_SCALE if m.state == _ARMED or m.recovering != 0 else min(1.0, m.speed_scale + c.dt / START_TIME)
     )
     slow = braking and greater(_largest_size(m.v_ref), _largest_size(m.w_ref)) < SLOW_REFERENCE
-    if braking and not slow:
+    m.floating = 0 if braking or m.state != _RUN else m.floating
+    if m.floating != 0:
+        m.v_ref[:], m.w_ref[:] = m.xd, m.omega  # what follows begins with the speed that the hand gave
+    if (braking and not slow) or m.floating != 0:
         _hold_here(c, m)  # the hold begins where the braking ends
     target, R = target_of(m, pursuing), m.R.copy()
     e, e_rot = np.zeros(3), np.zeros(3)
@@ -187,9 +190,11 @@ def _waited(c: RecordRow, m: RecordRow) -> bool:
 def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> int:
     """Advance the timers of the way to the goal; return DIAGNOSE when it is time to ask what holds the arm."""
     if m.has_goal == 0 or m.state != _RUN:
-        if m.status == _NO_GOAL:
+        status = _FLOATING if m.floating != 0 else _NO_GOAL
+        if m.status == status:
             return SAME
         _forget_goal(m)
+        m.status = status
         return WORDS
     if arrived(p, target.tolerance, target.tolerance_rot):
         changed = _take_status(m, _ARRIVED)

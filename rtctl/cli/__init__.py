@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import commission, experiments, init, logs, offline, operate, page, plan
+from rtctl.cli import campaign, commission, experiments, init, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 
@@ -42,6 +42,7 @@ def build_parser() -> Parser:
     plan.add(commands)
     offline.add_after(commands)
     experiments.add(commands)
+    campaign.add(commands)
     logs.add(commands)
     return parser
 

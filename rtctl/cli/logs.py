@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rtctl.cli import pictures, replays
+from rtctl.cli import identify, pictures, replays
 from rtctl.cli.parser import Commands, Parser, command, log_file, positive
 from rtctl.cli.progress import bar
 from rtctl.cli.values import table
@@ -75,6 +75,7 @@ def add(commands: Commands) -> None:
     tail.add_argument("--for", dest="seconds", metavar="S", type=positive, default=float("inf"), help="then stop")
     pictures.add(actions)
     replays.add(actions)
+    identify.add(actions)
 
 
 RECOVER_EXAMPLE = "rtctl log recover logs/\n  rtctl log recover cut.mcap --out whole.mcap"

@@ -121,7 +121,7 @@ def _run(arguments: argparse.Namespace) -> int:
             stack.enter_context(lobby)
             print(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", file=sys.stderr, flush=True)
         _refuse_config(arguments.config)
-        _prepare(arguments.config, lobby=lobby)
+        prepare(arguments.config, lobby=lobby)
         from rtctl.app.daemon import run
 
         return run(
@@ -188,7 +188,7 @@ def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.app.sim import simulate
     from rtctl.spec.scenario import load_scenario, robot_file
 
-    _prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
+    prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
     with page.viewer(arguments) as shown:
         result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime, shown=shown)
     if arguments.json:
@@ -219,11 +219,11 @@ def _warm(arguments: argparse.Namespace) -> int:
     if not Path(config).is_file():
         raise UsageError(f"warm: {config}: no such file, wanted a config")
     vehicle_of(Path(config)).load(Path(config), None)
-    _prepare(config, strict=True)
+    prepare(config, strict=True)
     return EXIT_OK
 
 
-def _prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> None:
+def prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> None:
     """Compile what a config's robot needs where that was not done yet, and say so: it takes a while.
 
     What goes wrong then is left to the command itself to find and to tell, unless strict.

@@ -20,6 +20,8 @@ VERBS = {
     "disarm": "come to rest, then disable the drives",
     "stop": "brake now; only an operator's reset leaves the stop",
     "reset": "leave a latched stop or fault, once its cause is gone",
+    "float": "let a hand move the arm: its weight is carried, limits and obstacles are kept; ends with hold or a goal",
+    "hold": "stay here, without a goal",
     "recover": "where a joint is beyond its limit: enable the drives, move slowly inward",
 }
 KEYS_OF = {
@@ -88,6 +90,12 @@ def add(commands: Commands) -> None:
     )
     goals.add_argument("--keep-going", action="store_true", help="go on after a goal that was refused or not reached")
     _add_obstacle(commands)
+    payload = command(commands, "payload", "tell what the tip carries", "rtctl payload 0.8 0 0 0.05", _payload)
+    payload.add_argument("mass", metavar="KG", type=number, help="0: nothing")
+    payload.add_argument(
+        "com", metavar="X Y Z", type=number, nargs="*", help="its centre in the tip's frame [m] (0 0 0)"
+    )
+    add_daemon(payload)
     status = command(commands, "status", "show how things stand", "rtctl status --watch", _status)
     status.add_argument("--watch", action="store_true", help="keep showing, ten times a second")
     status.add_argument("--json", action="store_true", help="print the daemon's reply; with --watch one a line")
@@ -153,6 +161,14 @@ def _verb(arguments: argparse.Namespace) -> int:
         return _said(_demand(arguments, {"verb": verb}), f"{verb}: accepted")
     with ready_session(arguments, verb, PATIENCE if verb in PATIENT else 0.0) as session:
         return told(verb, perform(session, verb, arguments.timeout))
+
+
+def _payload(arguments: argparse.Namespace) -> int:
+    if len(arguments.com) not in (0, 3):
+        raise UsageError(f"payload: got {len(arguments.com)} numbers after KG, wanted X Y Z or none")
+    message: Json = {"verb": "payload", "mass_kg": arguments.mass}
+    message |= {"com_m": arguments.com} if arguments.com else {}
+    return _said(_demand(arguments, message), f"payload: {arguments.mass:g} kg")
 
 
 def _set(arguments: argparse.Namespace) -> int:

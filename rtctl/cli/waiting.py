@@ -25,6 +25,8 @@ AIMS = {
     "recover": "the robot is armed and moves inward",
     "disarm": "it rests and the drives are off",
     "stop": "it rests",
+    "float": "a hand may move the arm",
+    "hold": "the arm holds itself",
     "reset": "the stop or fault is left",
 }
 
@@ -121,6 +123,10 @@ def _end(verb: str, status: Json, since: float, idle: float) -> End | None:
         return (
             None if state == "ARMED" else End(state == "RUN", state + ("" if state == "RUN" else _why(status, since)))
         )
+    if verb in ("float", "hold"):
+        floats = status.get("status") == "floating"
+        done = state == "RUN" and floats == (verb == "float")
+        return End(done, ("floating" if floats else "holding") if done else state + _why(status, since))
     if verb == "stop":
         rests = bool(status.get("at_rest", True))
         if state == "SAFE_STOP":

@@ -18,10 +18,21 @@ from rtctl.arm.task import point_of, within
 from rtctl.errors import ConfigError, RequestError
 from rtctl.plain import Json
 from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
-from rtctl.spec.obstacles import Cloud, Mesh, Name, Obstacle, Orientation, Place, RollPitchYaw, contradiction, shape_of
+from rtctl.spec.obstacles import (
+    Cloud,
+    Length,
+    Mesh,
+    Name,
+    Obstacle,
+    Orientation,
+    Place,
+    RollPitchYaw,
+    contradiction,
+    shape_of,
+)
 from rtctl.spec.read import convert, type_info
 from rtctl.spec.robot import Angles
-from rtctl.types import Goal, ObstacleEdit, Request, Task, Verb
+from rtctl.types import Goal, ObstacleEdit, Payload, Request, Task, Verb
 
 OBSTACLES_MAX = 64  # in one camera frame
 CLOUD_MARK = b"RTCLOUD1"
@@ -68,6 +79,25 @@ class Reset(_Message, tag="reset", frozen=True):
 
 class Recover(_Message, tag="recover", frozen=True):
     """Allow a slow move inward from beyond a joint limit."""
+
+
+class Float(_Message, tag="float", frozen=True):
+    """Let a hand move the arm: what it weighs is carried, nothing is driven; `hold` or a goal ends it."""
+
+
+class Hold(_Message, tag="hold", frozen=True):
+    """Stay here, without a goal."""
+
+
+class PayloadMessage(_Message, tag="payload", frozen=True, kw_only=True):
+    """Tell what the tip carries now; 0 kg: nothing."""
+
+    mass_kg: Annotated[float, Meta(ge=0.0, le=200.0)]
+    com_m: Annotated[tuple[Length, Length, Length], Meta(description="its centre, in the tip's frame")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 class Status(_Message, tag="status", frozen=True):
@@ -133,8 +163,30 @@ class CloudFrame(NamedTuple):
     steps: bytes
 
 
-Message = Arm | Disarm | Stop | Reset | Recover | Status | World | GoalMessage | ObstacleMessage | ObstaclesMessage
-VERBS = {Arm: Verb.ARM, Disarm: Verb.DISARM, Stop: Verb.STOP, Reset: Verb.RESET, Recover: Verb.RECOVER}
+Message = (
+    Arm
+    | Disarm
+    | Stop
+    | Reset
+    | Recover
+    | Float
+    | Hold
+    | PayloadMessage
+    | Status
+    | World
+    | GoalMessage
+    | ObstacleMessage
+    | ObstaclesMessage
+)
+VERBS = {
+    Arm: Verb.ARM,
+    Disarm: Verb.DISARM,
+    Stop: Verb.STOP,
+    Reset: Verb.RESET,
+    Recover: Verb.RECOVER,
+    Float: Verb.FLOAT,
+    Hold: Verb.HOLD,
+}
 
 KNOWN = frozenset(str(t.tag) for t in type_info(Message).types) | {"cloud"}
 _decoder = msgspec.json.Decoder(Message, strict=True)
@@ -237,6 +289,10 @@ def request_of(
             return Request(goal=_goal_of(message, bounds, orientation))
         case ObstacleMessage() | ObstaclesMessage() | CloudFrame():
             return Request(obstacles=tuple(notice.edit(0.0) for notice in notices_of(message, now)))
+        case PayloadMessage():
+            if bounds.local is not None:
+                raise RequestError("payload: a base carries what it carries, wanted an arm")
+            return Request(payload=Payload(message.mass_kg, *message.com_m))
         case Status() | World():
             return Request()
         case _:

@@ -37,7 +37,12 @@ class PlantTable(Table, frozen=True, kw_only=True):
     mass_error: Annotated[Factor | ByLink, Meta(description="fraction added to a link's mass")] = 0.0
     inertia_error: Annotated[Factor | ByLink, Meta(description="fraction added to a link's inertia tensor")] = 0.0
     urdf_dynamics: Annotated[bool, Meta(description="the damping and friction of the URDF act, too")] = False
-    coulomb_Nm: Annotated[Torque | Torques, Meta(description="friction of a joint that slides")] = 0.0
+    coulomb_Nm: (
+        Annotated[
+            Torque | Torques, Meta(description="friction of a joint that slides; default: as the robot file says")
+        ]
+        | None
+    ) = None
     static_Nm: Annotated[Torque | Torques, Meta(description="friction of one that sticks; at least coulomb_Nm")] = 0.0
     viscous_Nms_rad: Annotated[Torque | Torques, Meta(description="beside the robot file's")] = 0.0
     torque_gain: Annotated[Gain | Gains, Meta(description="what the joint gets, of what the drive says it gives")] = 1.0

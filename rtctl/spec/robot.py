@@ -24,6 +24,15 @@ class Table(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A TOML table: unknown keys are refused."""
 
 
+class FrictionTable(Table, frozen=True, kw_only=True):
+    """Friction of a joint that the law gives beforehand."""
+
+    coulomb_Nm: Annotated[float, Meta(ge=0.0, le=1000.0, description="of a joint that slides, whatever its speed")] = (
+        0.0
+    )
+    viscous_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="beside friction_Nms_rad, which damps")] = 0.0
+
+
 class Joint(Table, frozen=True, kw_only=True):
     """One joint, in the order of the chain from the base to the tip."""
 
@@ -37,6 +46,7 @@ class Joint(Table, frozen=True, kw_only=True):
     drive: Annotated[Name, Meta(description="a drive of the catalogue or of [drives]: its scales on the wire")]
     armature_kg_m2: Annotated[float, Meta(ge=0.0, le=100.0, description="motor inertia seen at the joint, J G^2")] = 0.0
     friction_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="viscous, seen at the joint, B G^2")] = 0.0
+    friction: Annotated[FrictionTable, Meta(description="given beforehand")] = FrictionTable()
     reply_id: Annotated[int, Meta(ge=1, le=0x7FE, description="of its replies; default: can_id + 0x10")] | None = None
     direction: Annotated[Literal[1, -1], Meta(description="-1: the drive counts the other way round")] = 1
     zero_rad: Annotated[Angle, Meta(description="the drive reads direction q + zero_rad")] = 0.0
@@ -211,6 +221,12 @@ class Safety(Table, frozen=True, kw_only=True):
     friction_ratio: Annotated[
         float, Meta(ge=0.0, le=0.5, description="of tau_max: friction that is compensated without being told")
     ] = 0.05
+    collision_ratio: Annotated[
+        float, Meta(ge=0.002, le=1.0, description="of tau_max: an external torque that comes faster is a contact")
+    ] = 0.1
+    collision_hard_ratio: Annotated[
+        float, Meta(ge=0.01, le=2.0, description="the same, after which the arm is driven no more")
+    ] = 0.4
     speed_ratio: Annotated[float, Meta(ge=1.0, le=1.5, description="of qd_max, beyond it a fault")] = 1.2
     limit_excess_rad: Annotated[float, Meta(ge=0.0, le=0.2, description="beyond a joint limit, then a fault")] = 0.02
     obstacle_stale_s: Annotated[

@@ -60,6 +60,12 @@ class FaultTable(Table, frozen=True, kw_only=True):
         float, Meta(ge=-360.0, le=360.0, description="of a range sensor, clockwise from the front")
     ] = -180.0
     to_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] = 180.0
+    link: Annotated[Key, Meta(description="of a push: the link that is pushed at its centre of mass")] | None = None
+    newton: Annotated[float, Meta(ge=0.0, le=1e4, description="of a push")] | None = None
+    direction: (
+        Annotated[tuple[Coordinate, Coordinate, Coordinate], Meta(description="of a push, in the world; default: down")]
+        | None
+    ) = None
     value: Annotated[float, Meta(ge=-1e4, le=1e4, description="how much, where the kind has a size")] | None = None
 
 

@@ -36,6 +36,7 @@ class Seen(NamedTuple):
     duration: float  # [s] played
     arrived: bool
     error: float  # [m] at the end
+    time_to_goal: float  # [s], infinite when it did not arrive
     contact: Contact | None  # the first
     retreat: float  # [m/s] of the arm's point at it
     can_retreat: float  # [m/s] that its joints allow at SPEED_BAND of their speed, those at a limit left out
@@ -59,10 +60,14 @@ class Seen(NamedTuple):
     digest: str
 
 
-@cache
 def robot_of(name: str) -> tuple[Robot, Config]:
     """Return a robot of configs/ and its config, derived once a process."""
-    path = CONFIGS / f"{name}.toml"
+    return robot_at(CONFIGS / f"{name}.toml")
+
+
+@cache
+def robot_at(path: Path) -> tuple[Robot, Config]:
+    """Return the robot of a file and its config, derived once a process."""
     config = cfg.load(path)
     return cfg.build(config, path), config
 
@@ -120,12 +125,16 @@ def _numbers(record: Any) -> bool:
     return True
 
 
-def play(table: dict[str, Any], index: int) -> Seen:
-    """Return what was seen of a scenario given as tables; it ends with its first contact, or settled at the goal."""
+def play(table: dict[str, Any], index: int, path: Path | None = None) -> Seen:
+    """Return what was seen of a scenario given as tables; it ends with its first contact, or settled at the goal.
+
+    path: the robot file, in place of the one in configs/.
+    """
     name = table["robot"]
-    robot, config = robot_of(name)
+    path = path or CONFIGS / f"{name}.toml"
+    robot, config = robot_at(path)
     scenario: Scenario = convert(table, Scenario, f"{name}:{index}")
-    simulator: Any = open_simulator(CONFIGS / f"{name}.toml", scenario, CONFIGS / "stress.toml")
+    simulator: Any = open_simulator(path, scenario, CONFIGS / "stress.toml")
     link = ArmLink(link_spec(config), InProcess.of(simulator))
     try:
         servo = Servo(ARM, robot, link, None, link.greet(lockstep=True))
@@ -170,6 +179,7 @@ def _seen(servo: ArmServo, watch: Watch, name: str, index: int) -> Seen:
         duration=watch.ticks * robot.dt,
         arrived=arrived,
         error=figures["final_error_m"] if figures["final_error_m"] is not None else np.inf,
+        time_to_goal=figures["time_to_goal_s"] if figures["time_to_goal_s"] is not None else np.inf,
         contact=contact,
         retreat=retreat,
         can_retreat=can,

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from rtctl.plain import Json
-from rtctl.types import Goal, ObstacleEdit, Request, Shape, Task, Verb
+from rtctl.types import Goal, ObstacleEdit, Payload, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
@@ -19,6 +19,8 @@ def encode_request(tick: int, request: Request) -> bytes:
             {"name": e.name, "age": e.age, "feed": e.feed} | ({} if e.shape is None else {"shape": _shape(e.shape)})
             for e in request.obstacles
         ]
+    if request.payload is not None:
+        body["payload"] = tuple(request.payload)
     return msgspec.json.encode(body)
 
 
@@ -36,7 +38,9 @@ def decode_request(data: bytes) -> tuple[int, Request]:
             )
             for e in body.get("obstacles", ())
         )
-        return int(body["tick"]), Request(Verb[body["verb"].upper()], None if goal is None else _goal(goal), edits)
+        payload = None if body.get("payload") is None else Payload(*map(float, body["payload"]))
+        verb = Verb[body["verb"].upper()]
+        return int(body["tick"]), Request(verb, None if goal is None else _goal(goal), edits, payload)
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"not a request: {error}") from None
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from rtctl.arm.robot import Robot
 from rtctl.design import Config
+from rtctl.experiment.scene import toml
 from rtctl.kernel.rotations import quat_of
 from rtctl.spec.obstacles import pose_at, shape_of
 from rtctl.spec.read import convert
@@ -190,19 +191,13 @@ KINDS = tuple(_SIZES)
 
 def toml_of(table: Table, comment: str) -> str:
     """Return a scenario as TOML that `rtctl sim` reads, to the same bits."""
-    lines = [f"# {comment}", ""]
-    lines += [f"{k} = {_value(v)}" for k, v in table.items() if not _is_tables(v)]
+    lines = [f"# {comment}", ""] if comment else []
+    lines += [f"{k} = {toml(v)}" for k, v in table.items() if not _is_tables(v)]
     for key, rows in table.items():
         for row in rows if _is_tables(rows) else ():
-            lines += ["", f"[[{key}]]", *(f"{k} = {_value(v)}" for k, v in row.items())]
+            lines += ["", f"[[{key}]]", *(f"{k} = {toml(v)}" for k, v in row.items())]
     return "\n".join(lines) + "\n"
 
 
 def _is_tables(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,1 @@
+"""The problems of MotionBenchMaker, played by the controller: `python -m tools.benchmark --help`."""
