@@ -6,6 +6,7 @@
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
 # make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
+# make docs    the site of documents, into out/site
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -17,7 +18,7 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench benchmark stress mutants install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants docs install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -45,6 +46,9 @@ benchmark: install
 
 mutants: install
 	$(BIN)/python -m tools.mutants
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 

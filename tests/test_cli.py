@@ -677,7 +677,7 @@ def test_whose_lock_is_passed_over_reaches_the_daemon(folder: Path, monkeypatch:
     monkeypatch.setattr(daemon, "run", run)
     config = folder / "toy.toml"
     config.write_text((ROOT / "configs" / "panda.toml").read_text())
-    monkeypatch.setattr("rtctl.cli.offline._prepare", lambda *_, **__: None)
+    monkeypatch.setattr("rtctl.cli.offline.prepare", lambda *_, **__: None)
     assert main(["run", str(config), "--pass-lock-of", "nobody", "--pass-lock-of", "12345"]) == EXIT_OK
     assert main(["run", str(config)]) == EXIT_OK
     assert asked == [{pwd.getpwnam("nobody").pw_uid, 12345}, frozenset()]

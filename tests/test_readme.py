@@ -1,15 +1,19 @@
 """README and the pages of docs say what the program does."""
 
 import re
+from importlib import util
 from pathlib import Path
 
 import pytest
 
 from rtctl.cli import main
+from tools import site
 from tools.faults import PAGES, with_table
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOP = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
+DOCUMENTS = [*TOP, *sorted((ROOT / "docs").glob("*.md"))]
+HOME = ROOT / "docs" / "index.md"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -22,19 +26,45 @@ def test_the_fault_tables_are_those_the_program_has(page):
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
 def test_every_file_it_links_to_is_there(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), target
+        assert target.startswith("https://") or (page.parent / target).exists(), target
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
 def test_every_page_is_reached_from_the_readme(page):
     linked = re.findall(r"\]\(([^)#]+)\)", DOCUMENTS[0].read_text(encoding="utf-8"))
-    tables = {ROOT / "docs" / "rates.md"}  # shown by the page of the experiments
-    assert page == DOCUMENTS[0] or page in tables or page in {ROOT / target for target in linked}
+    shown = {ROOT / "docs" / "rates.md", HOME}  # by the page of the experiments; by the site
+    assert page == DOCUMENTS[0] or page in shown or page in {ROOT / target for target in linked}
+
+
+def test_the_readme_is_a_page():
+    text = DOCUMENTS[0].read_text(encoding="utf-8")
+    assert len(text.split()) < 900
+    assert max(map(len, text.splitlines())) < 400  # a row of a table
+
+
+def test_the_site_shows_every_page():
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").glob("*.md"):
+        assert f": {page.name}\n" in nav, page.name
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.name)
+def test_every_module_and_tool_they_run_is_there(page):
+    for name in re.findall(r"python -m ((?:tools|firmware_sim|rtctl)[\w.]*)", page.read_text(encoding="utf-8")):
+        assert util.find_spec(name) is not None, name
+
+
+def test_the_equations_become_mathml():
+    """Of the page that has them, by the hook that the site is built with."""
+    text = site.on_page_markdown((ROOT / "docs" / "concepts.md").read_text(encoding="utf-8"))
+    assert text.count("<math") >= 10
+    assert "$$" not in text
+    assert "\\(" not in text
 
 
 def test_every_command_they_show_exists(capsys):
     text = "\n".join(page.read_text(encoding="utf-8") for page in DOCUMENTS)
-    shown = set(re.findall(r"^ +rtctl (\w+)", text, re.M))
+    shown = set(re.findall(r"^ {4,}(?:\.venv/bin/)?rtctl (\w+)", text, re.M))
     assert {"check", "run", "arm", "goal", "sim", "log", "plan", "experiment"} <= shown
     for verb in shown:
         with pytest.raises(SystemExit) as stop:

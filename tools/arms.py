@@ -65,7 +65,7 @@ CASES = (
     case("KUKA iiwa 14", "rtbdata:lbr_iiwa_14_r820", "--repair"),
     case("KUKA KR 5", "rtbdata:kr5_arc", "--repair"),
     case("KUKA KR 210", "rtbdata:kr210l150", "--repair"),
-    case("ABB IRB 140", "rtbdata:irb140", "--repair"),
+    case("ABB IRB 140", "rtbdata:irb140", "--repair --scale 0.2535"),
     case("PUMA 560", "rtbdata:puma560_robot", "--repair"),
     case("Sawyer", "robosuite:sawyer"),
     case("Baxter left", "baxter", "--side left --repair"),

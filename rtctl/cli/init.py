@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rtctl.cli.parser import Commands, command
+from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_OK, UsageError
 
 if TYPE_CHECKING:
@@ -40,6 +40,9 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--exclude", metavar="LINK", action="append", default=[], help="leave a link out, and what it carries"
     )
+    parser.add_argument(
+        "--scale", metavar="S", type=positive, default=1.0, help="of all lengths: 0.001 for millimetres"
+    )
     parser.add_argument("--drives", metavar="MAKER:TYPES", default="virtual", help="damiao:8009,4340,… or %(default)s")
     parser.add_argument("--repair", action="store_true", help="replace impossible inertias and torques, and say so")
     parser.add_argument("--force", action="store_true", help="write over files that are there")
@@ -63,7 +66,8 @@ def _init(arguments: argparse.Namespace) -> int:
     config = Path(arguments.out) / f"{name}.toml"
     if config.exists() and not arguments.force:
         raise UsageError(f"{config}: got a file that is there already, wanted --force or another --name or --out")
-    asked = Asked(arguments.tip, arguments.side, arguments.joints, _locks(arguments.lock), arguments.exclude)
+    locks = _locks(arguments.lock)
+    asked = Asked(arguments.tip, arguments.side, arguments.joints, locks, arguments.exclude, arguments.scale)
     made = _made(found, Path(arguments.out), name, asked, arguments)
     for line in made.told:
         print(f"  {line}")

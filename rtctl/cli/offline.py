@@ -14,6 +14,7 @@ from rtctl.cli import page
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 from rtctl.plain import Json
+from rtctl.spec.shipped import shipped
 
 if TYPE_CHECKING:
     from rtctl.hal.lobby import Lobby
@@ -53,7 +54,9 @@ def add_after(commands: Commands) -> None:
         "rtctl sim scenarios/demo.toml --json --log demo.mcap",
         _sim,
     )
-    sim.add_argument("scenario", metavar="SCENARIO")
+    sim.add_argument(
+        "scenario", metavar="SCENARIO", help="a file, or the name of one that comes with the program: demo"
+    )
     sim.add_argument("--json", action="store_true", help="print one JSON object")
     sim.add_argument("--log", metavar="FILE", default="", help="write an MCAP log")
     sim.add_argument("--realtime", action="store_true", help="no faster than the clock")
@@ -187,7 +190,9 @@ def _stranger(name: str) -> int:
 def _sim(arguments: argparse.Namespace) -> int:
     from rtctl.app.sim import simulate
     from rtctl.spec.scenario import load_scenario, robot_file
+    from rtctl.spec.shipped import scenario_file
 
+    arguments.scenario = scenario_file(arguments.scenario)
     prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
     with page.viewer(arguments) as shown:
         result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime, shown=shown)
@@ -215,7 +220,7 @@ def _missed(result: Json) -> str:
 def _warm(arguments: argparse.Namespace) -> int:
     from rtctl.app.choose import vehicle_of
 
-    config = arguments.config or str(Path(__file__).parents[2] / "configs" / "panda.toml")
+    config = arguments.config or str(shipped() / "panda.toml")
     if not Path(config).is_file():
         raise UsageError(f"warm: {config}: no such file, wanted a config")
     vehicle_of(Path(config)).load(Path(config), None)

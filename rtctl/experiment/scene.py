@@ -17,11 +17,12 @@ from rtctl.plain import Json
 from rtctl.spec.obstacles import shape_of
 from rtctl.spec.read import convert
 from rtctl.spec.scenario import Scenario
+from rtctl.spec.shipped import shipped
 from rtctl.spec.urdf import urdf_file
 from rtctl.types import F64, I64, Shape, Truth
 
 Say = Callable[[float], None]  # takes the part (0 to 1) that is done
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = shipped()
 
 
 def unsaid(part: float) -> None:

@@ -46,6 +46,7 @@ class Asked(NamedTuple):
     joints: str = ""  # pattern of names
     lock: Mapping[str, float] = {}
     exclude: Sequence[str] = ()  # links left out, with all that they carry
+    scale: float = 1.0  # of all lengths: 0.001 for a description in millimetres
 
 
 class Described(NamedTuple):
@@ -188,8 +189,25 @@ def take(robot: Described, asked: Asked) -> Arm:
         told.append(f"{len(locked)} other joints are locked at 0{f', but {words}' if at else ''}; --lock NAME=VALUE")
     if robot.mimic:
         told.append(f"mimic joints are locked: {', '.join(sorted(robot.mimic)[:4])}")
+    if asked.scale != 1.0:
+        told.append(f"all lengths are {asked.scale:g} times those of the description")
+        _scaled(reduced, (collision, visual), asked.scale)
     joints = tuple(_joint(robot, reduced, k, told) for k in range(1, reduced.njoints))
     return Arm(reduced, collision, visual, joints, tip, locked, told)
+
+
+def _scaled(model: Any, geometries: Sequence[Any], scale: float) -> None:
+    """Scale all lengths of a model and what it carries; masses stay, moments of inertia go with the square."""
+    for k in range(model.njoints):
+        model.jointPlacements[k].translation = scale * np.array(model.jointPlacements[k].translation)
+        old = model.inertias[k]
+        model.inertias[k] = pin.Inertia(old.mass, scale * np.array(old.lever), scale**2 * np.array(old.inertia))
+    for frame in model.frames:
+        frame.placement.translation = scale * np.array(frame.placement.translation)
+    for geometry in geometries:
+        for thing in geometry.geometryObjects:
+            thing.placement.translation = scale * np.array(thing.placement.translation)
+            thing.meshScale = scale * np.array(thing.meshScale)
 
 
 def _joint(robot: Described, model: Any, k: int, told: list[str]) -> Joint:

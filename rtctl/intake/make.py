@@ -44,7 +44,7 @@ def make(source: Source, folder: Path, name: str, asked: Asked, drives: str = ""
     """Write NAME.toml, NAME.urdf, NAME_meshes/ and NAME_first.toml into a folder. Raises RtctlError."""
     arm = take(describe(source, asked.exclude), asked)
     told = list(arm.told)
-    solid = pieces(arm, told)
+    solid = pieces(arm, told, asked.scale)
     if not any(p.joint for p in solid):
         raise IntakeError(f"{source.origin}: no geometry on any moving link: nothing can be kept from obstacles")
     _check_inertias(arm, solid, told, repair)

@@ -28,32 +28,36 @@ class Piece(NamedTuple):
     primitive: str  # URDF's element for a box, ball or cylinder, '' for a hull
 
 
-def pieces(arm: Any, told: list[str]) -> list[Piece]:
-    """Return the pieces of an arm's collision geometry; links that have none are given the hulls of what one sees."""
-    found = [p for p in map(_piece(arm.model), arm.collision.geometryObjects) if p is not None]
+def pieces(arm: Any, told: list[str], scale: float = 1.0) -> list[Piece]:
+    """Return the pieces of an arm's collision geometry; links that have none are given the hulls of what one sees.
+
+    scale: of the shapes; where they are is scaled already.
+    """
+    made = _piece(arm.model, scale)
+    found = [p for p in map(made, arm.collision.geometryObjects) if p is not None]
     bare = [j for j in range(arm.model.njoints) if j not in {p.joint for p in found}]
     seen = [g for g in arm.visual.geometryObjects if int(g.parentJoint) in bare]
-    filled = [p for p in map(_piece(arm.model), seen) if p is not None]
+    filled = [p for p in map(made, seen) if p is not None]
     if filled:
         names = sorted({arm.model.names[p.joint] if p.joint else "the base" for p in filled})
         told.append(f"no collision geometry at {', '.join(names[:4])}: hulls of the visual meshes are taken")
     return [*found, *filled]
 
 
-def _piece(model: Any) -> Any:
+def _piece(model: Any, scale: float) -> Any:
     def made(thing: Any) -> Piece | None:
         shape = thing.geometry
         if isinstance(shape, coal.Plane | coal.Halfspace):
             return None
         try:
-            corners = _points(shape, str(thing.name))
+            corners = scale * _points(shape, str(thing.name))
         except ConfigError:
             return None
         if len(corners) < 4 or not (np.abs(corners) <= REACH).all():
             return None
         name = model.frames[thing.parentFrame].name
         corners, faces = hull(corners)
-        return Piece(int(thing.parentJoint), name, thing.placement, corners, faces, _primitive(shape))
+        return Piece(int(thing.parentJoint), name, thing.placement, corners, faces, _primitive(shape, scale))
 
     return made
 
@@ -66,14 +70,14 @@ def _points(shape: Any, name: str) -> F64:
     return corners
 
 
-def _primitive(shape: Any) -> str:
+def _primitive(shape: Any, scale: float) -> str:
     if isinstance(shape, coal.Box):
-        size = " ".join(f"{2.0 * float(h):.9g}" for h in shape.halfSide)
+        size = " ".join(f"{2.0 * scale * float(h):.9g}" for h in shape.halfSide)
         return f'<box size="{size}"/>'
     if isinstance(shape, coal.Sphere):
-        return f'<sphere radius="{shape.radius:.9g}"/>'
+        return f'<sphere radius="{scale * shape.radius:.9g}"/>'
     if isinstance(shape, coal.Cylinder):
-        return f'<cylinder radius="{shape.radius:.9g}" length="{2.0 * shape.halfLength:.9g}"/>'
+        return f'<cylinder radius="{scale * shape.radius:.9g}" length="{2.0 * scale * shape.halfLength:.9g}"/>'
     return ""
 
 

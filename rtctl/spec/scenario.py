@@ -23,6 +23,7 @@ from rtctl.spec.obstacles import (
 from rtctl.spec.plant import PlantTable
 from rtctl.spec.read import convert, name_place, read
 from rtctl.spec.robot import Angle, Angles, Key, Table, Text
+from rtctl.spec.shipped import shipped
 from rtctl.types import F64, Goal, ObstacleEdit
 
 Moment = Annotated[float, Meta(ge=0.0, le=3600.0)]
@@ -113,7 +114,7 @@ def robot_file(scenario: Scenario, path: str | Path) -> Path:
             here / "configs",
             here.parent / "configs",
             Path("configs"),
-            Path(__file__).parents[2] / "configs",
+            shipped(),
         ]
         tried = [root / f"{robot}.toml" for root in roots]
     found = next((p for p in tried if p.is_file()), None)
