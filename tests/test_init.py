@@ -18,6 +18,7 @@ from rtctl.intake.make import Made, make
 from rtctl.intake.shapes import CORNERS_MAX, hull
 from rtctl.intake.sources import IntakeError, Source, find, index
 
+WHOLE = Asked()
 INERTIAL = (
     '<inertial><origin xyz="0 0 0.1"/><mass value="{m}"/>'
     '<inertia ixx="0.004" iyy="0.004" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -60,7 +61,7 @@ def two_armed() -> str:
 
 
 def made(
-    folder: Path, text: str, asked: Asked = Asked(), name: str = "arm", suffix: str = ".urdf", **how: object
+    folder: Path, text: str, asked: Asked = WHOLE, name: str = "arm", suffix: str = ".urdf", **how: object
 ) -> Made:
     path = folder / f"source{suffix}"
     path.write_text(text)
@@ -186,13 +187,15 @@ def test_a_joint_without_end_and_one_without_speed_are_given_bounds_that_are_tol
 
 
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><geom type="box" size=".05 .05 .05"/>
-<body name="a" pos="0 0 .1"><joint name="m0" axis="0 0 1" range="-2 2"/><inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .005"/>
+<body name="a" pos="0 0 .1"><joint name="m0" axis="0 0 1" range="-2 2"/>
+<inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .005"/>
 <geom type="capsule" fromto="0 0 0 0 0 .2" size=".03"/><body name="b" pos="0 0 .25">
 <joint name="m1" axis="0 1 0" range="-2 2"/><inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .005"/>
 <geom type="capsule" fromto="0 0 0 0 0 .2" size=".03"/><body name="c" pos="0 0 .25">
 <joint name="m2" axis="0 1 0" range="-2 2"/><inertial pos="0 0 .1" mass=".5" diaginertia=".005 .005 .002"/>
 <geom type="capsule" fromto="0 0 0 0 0 .2" size=".03"/></body></body></body></body></worldbody>
-<actuator><motor joint="m0" ctrlrange="-9 9"/><motor joint="m1" ctrlrange="-30 30"/><motor joint="m2" ctrlrange="-9 9" gear="2"/></actuator>
+<actuator><motor joint="m0" ctrlrange="-9 9"/><motor joint="m1" ctrlrange="-30 30"/>
+<motor joint="m2" ctrlrange="-9 9" gear="2"/></actuator>
 </mujoco>"""
 
 

@@ -5,7 +5,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -52,9 +52,9 @@ class Asked(NamedTuple):
 class Described(NamedTuple):
     """A whole robot as its description has it."""
 
-    model: Any  # pin.Model
-    collision: Any  # pin.GeometryModel
-    visual: Any
+    model: pin.Model
+    collision: pin.GeometryModel
+    visual: pin.GeometryModel
     mimic: frozenset[str]
     effort: Mapping[str, float]  # [Nm] by joint, where the file states them apart
     told: list[str]
@@ -74,9 +74,9 @@ class Joint(NamedTuple):
 class Arm(NamedTuple):
     """The arm alone: a model of its joints, in their order, and the geometry that they carry."""
 
-    model: Any
-    collision: Any
-    visual: Any
+    model: pin.Model
+    collision: pin.GeometryModel
+    visual: pin.GeometryModel
     joints: tuple[Joint, ...]
     tip: str
     locked: dict[str, float]
@@ -196,7 +196,7 @@ def take(robot: Described, asked: Asked) -> Arm:
     return Arm(reduced, collision, visual, joints, tip, locked, told)
 
 
-def _scaled(model: Any, geometries: Sequence[Any], scale: float) -> None:
+def _scaled(model: pin.Model, geometries: Sequence[pin.GeometryModel], scale: float) -> None:
     """Scale all lengths of a model and what it carries; masses stay, moments of inertia go with the square."""
     for k in range(model.njoints):
         model.jointPlacements[k].translation = scale * np.array(model.jointPlacements[k].translation)
@@ -210,7 +210,7 @@ def _scaled(model: Any, geometries: Sequence[Any], scale: float) -> None:
             thing.meshScale = scale * np.array(thing.meshScale)
 
 
-def _joint(robot: Described, model: Any, k: int, told: list[str]) -> Joint:
+def _joint(robot: Described, model: pin.Model, k: int, told: list[str]) -> Joint:
     """Return joint k with what its description states."""
     name, v = model.names[k], model.idx_vs[k]
     low, high = -TURN, TURN
@@ -233,7 +233,7 @@ def _usable(value: float, most: float) -> float:
     return value if 0.0 < value < most else math.nan
 
 
-def frame_of(model: Any, name: str) -> Any:
+def frame_of(model: pin.Model, name: str) -> pin.Frame:
     """Return a frame by name: a body's before others of that name; None where there is none."""
     found = [f for f in model.frames if f.name == name]
     return next((f for f in found if f.type == pin.FrameType.BODY), found[0] if found else None)
@@ -336,7 +336,7 @@ def _tip(robot: Described, end: int, told: list[str]) -> str:
     return str(chosen.name)
 
 
-def impossible(inertia: Any) -> str:
+def impossible(inertia: pin.Inertia) -> str:
     """Return why no body has such an inertia, '' where one may."""
     if inertia.mass < 1e-5:
         return f"a mass of {inertia.mass:.3g} kg"

@@ -4,7 +4,7 @@ import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -83,7 +83,7 @@ def _check_inertias(arm: Arm, solid: Sequence[Piece], told: list[str], repair: b
         told.append(f"{name}: its link has {why}: repaired to a solid body of {made.mass:.3g} kg")
 
 
-def _solid(inertia: Any, of: Sequence[Piece]) -> Any:
+def _solid(inertia: pin.Inertia, of: Sequence[Piece]) -> pin.Inertia:
     """Return the inertia of a box about a link's geometry, of its mass or, without one, of a usual density."""
     if not of:
         return pin.Inertia(max(inertia.mass, 0.05), np.array(inertia.lever), 1e-4 * np.eye(3))

@@ -1,15 +1,18 @@
 """Collision geometry of an arm as convex pieces that every program reads: boxes, balls, cylinders, hulls as STL."""
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import coal
 import numpy as np
+import pinocchio as pin
 from scipy.spatial import ConvexHull, QhullError
 
 from rtctl.design.solids import REACH, _corners
 from rtctl.errors import ConfigError
+from rtctl.intake.body import Arm
 from rtctl.types import F64, I64
 
 CORNERS_MAX = 120  # of a hull: what has more is put into one with fewer faces that contains it
@@ -22,13 +25,13 @@ class Piece(NamedTuple):
 
     joint: int  # Pinocchio's
     frame: str  # that it belongs to
-    placement: Any  # pin.SE3 in the joint's frame
+    placement: pin.SE3  # in the joint's frame
     corners: F64  # (v, 3) [m] in the piece's frame
     faces: I64  # (f, 3)
     primitive: str  # URDF's element for a box, ball or cylinder, '' for a hull
 
 
-def pieces(arm: Any, told: list[str], scale: float = 1.0) -> list[Piece]:
+def pieces(arm: Arm, told: list[str], scale: float = 1.0) -> list[Piece]:
     """Return the pieces of an arm's collision geometry; links that have none are given the hulls of what one sees.
 
     scale: of the shapes; where they are is scaled already.
@@ -44,8 +47,8 @@ def pieces(arm: Any, told: list[str], scale: float = 1.0) -> list[Piece]:
     return [*found, *filled]
 
 
-def _piece(model: Any, scale: float) -> Any:
-    def made(thing: Any) -> Piece | None:
+def _piece(model: pin.Model, scale: float) -> Callable[[pin.GeometryObject], Piece | None]:
+    def made(thing: pin.GeometryObject) -> Piece | None:
         shape = thing.geometry
         if isinstance(shape, coal.Plane | coal.Halfspace):
             return None
@@ -62,7 +65,7 @@ def _piece(model: Any, scale: float) -> Any:
     return made
 
 
-def _points(shape: Any, name: str) -> F64:
+def _points(shape: coal.CollisionGeometry, name: str) -> F64:
     if isinstance(shape, coal.Ellipsoid):
         ball: F64 = _corners(coal.Sphere(1.0), name)
         return np.asarray(ball * np.array(shape.radii))
@@ -70,7 +73,7 @@ def _points(shape: Any, name: str) -> F64:
     return corners
 
 
-def _primitive(shape: Any, scale: float) -> str:
+def _primitive(shape: coal.CollisionGeometry, scale: float) -> str:
     if isinstance(shape, coal.Box):
         size = " ".join(f"{2.0 * scale * float(h):.9g}" for h in shape.halfSide)
         return f'<box size="{size}"/>'
@@ -114,7 +117,7 @@ def _simpler(corners: F64) -> F64:
     return out
 
 
-def _outward(corners: F64, found: Any) -> tuple[F64, I64]:
+def _outward(corners: F64, found: ConvexHull) -> tuple[F64, I64]:
     """Return corners and faces with the corners of each face counter-clockwise from outside."""
     faces = found.simplices.astype(np.int64).copy()
     a, b, c = (corners[faces[:, k]] for k in range(3))

@@ -1,7 +1,7 @@
 """The URDF of an arm alone: its joints with usable limits, inertias, convex collision geometry, what one sees."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -63,7 +63,7 @@ def write(folder: Path, name: str, origin: str, arm: Arm, limits: list[Limits], 
     return path
 
 
-def _carrier(model: Any, j: int) -> str:
+def _carrier(model: pin.Model, j: int) -> str:
     """Return the name of the link that a joint moves: that of the body at it, where there is one."""
     if j == 0:
         return "arm_base"
@@ -85,12 +85,12 @@ def _numbers(values: F64) -> str:
     return " ".join(f"{float(v) + 0.0:.9g}" for v in values)
 
 
-def _origin(placement: Any) -> str:
+def _origin(placement: pin.SE3) -> str:
     rpy = pin.rpy.matrixToRpy(np.array(placement.rotation))
     return f'<origin xyz="{_numbers(np.array(placement.translation))}" rpy="{_numbers(rpy)}"/>'
 
 
-def _inertial(inertia: Any) -> list[str]:
+def _inertial(inertia: pin.Inertia) -> list[str]:
     I = np.array(inertia.inertia)
     keys = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
     moments = " ".join(f'{key}="{I[a, b]:.9g}"' for key, a, b in keys)
@@ -111,7 +111,7 @@ def _collision(piece: Piece, folder: Path, file: str) -> str:
     return f"    <collision>{_origin(piece.placement)}<geometry>{shape}</geometry></collision>"
 
 
-def _visual(thing: Any) -> str:
+def _visual(thing: pin.GeometryObject) -> str:
     """Return what one sees of a mesh, by the maker's file; '' for what is no mesh of a file."""
     path = Path(str(thing.meshPath))
     if path.suffix.lower() not in LOOKS or not path.is_file():
@@ -120,7 +120,7 @@ def _visual(thing: Any) -> str:
     return f"    <visual>{_origin(thing.placement)}<geometry>{shape}</geometry></visual>"
 
 
-def _joint(model: Any, k: int, carriers: list[str], limit: Limits) -> list[str]:
+def _joint(model: pin.Model, k: int, carriers: list[str], limit: Limits) -> list[str]:
     joint = model.joints[k]
     data = joint.createData()
     joint.calc(data, pin.neutral(model)[model.idx_qs[k] : model.idx_qs[k] + model.nqs[k]])
@@ -139,7 +139,7 @@ def _joint(model: Any, k: int, carriers: list[str], limit: Limits) -> list[str]:
     ]
 
 
-def _fixed(parent: str, child: str, placement: Any) -> list[str]:
+def _fixed(parent: str, child: str, placement: pin.SE3) -> list[str]:
     return [
         f'  <joint name={quoteattr(child + "_fixed")} type="fixed">',
         f"    {_origin(placement)}",
