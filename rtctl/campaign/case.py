@@ -50,6 +50,7 @@ class Scene(NamedTuple):
     table: Json
     where: Path  # the file that relative paths are looked for beside
     reference_s: float | None = None  # what a certified way to the goal takes under the same limits
+    certificate: list[list[float]] | None = None  # (k, n) [rad] that way
     tolerance: tuple[float, float] | None = None  # [m], [rad] within which the end counts, None: the goal's own
 
 

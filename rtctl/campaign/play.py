@@ -1,5 +1,6 @@
 """One run of a campaign, on a worker: its scene made, played and put into a row. Nothing that fails ends a worker."""
 
+import json
 import os
 import socket
 import time
@@ -199,4 +200,7 @@ def save(case: Case, scene: Scene, folder: Path, name: str) -> tuple[Path, Path]
         if "file" in obstacle:
             obstacle["file"] = str((scene.where.resolve().parent / obstacle["file"]).resolve())
     path.write_text(toml_of(table, f"{case.source} {case.set} {case.seed}:{case.number}"), encoding="utf-8")
+    if scene.certificate is not None:
+        way = {"reference_s": scene.reference_s, "q_rad": scene.certificate}
+        (folder / f"{name}_way.json").write_text(json.dumps(way) + "\n", encoding="utf-8")
     return path, robot

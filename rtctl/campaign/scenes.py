@@ -44,8 +44,8 @@ Table = dict[str, Any]
 def scenario_of(robot: Robot, config: Config, seed: int, index: int) -> Table:
     """Return the tables of scenario `index` of a robot."""
     rng = np.random.default_rng([seed, index, *robot.name.encode()])
-    start = _posture(robot, config, rng, START_MARGIN)
-    end = _posture(robot, config, rng, config.avoid.joint_influence_rad)
+    start = posture(robot, config, rng, START_MARGIN)
+    end = posture(robot, config, rng, config.avoid.joint_influence_rad)
     tip = robot.body.evaluate(end, np.zeros(robot.n), robot.points, robot.own)
     goal: Table = {"at_s": GOAL_AT, "position_m": _round(tip.x)}
     if rng.random() < 0.5:
@@ -55,7 +55,7 @@ def scenario_of(robot: Robot, config: Config, seed: int, index: int) -> Table:
     obstacles: list[Table] = []
     wanted = int(rng.integers(1, MOST + 1))
     while len(obstacles) < wanted:
-        found = _obstacle(robot, NAMES[len(obstacles)], start, end, lasts, rng)
+        found = obstacle(robot, NAMES[len(obstacles)], start, end, lasts, rng)
         if found is None and obstacles:
             wanted -= 1
         elif found is not None:
@@ -78,7 +78,7 @@ def _unit(wxyz: F64) -> list[float]:
     return [float(f"{v:.9f}") for v in wxyz]
 
 
-def _posture(robot: Robot, config: Config, rng: np.random.Generator, margin: float) -> F64:
+def posture(robot: Robot, config: Config, rng: np.random.Generator, margin: float) -> F64:
     """Return joint angles (n,) [rad] inside the limits by `margin` at which the arm is clear of itself."""
     for _ in range(10_000):
         q: F64 = rng.uniform(robot.q_min + margin, robot.q_max - margin)
@@ -105,8 +105,10 @@ def _column(name: str) -> tuple[F64, F64]:
 _ROBOTS: dict[str, Robot] = {}  # by name: arrays are no keys of a cache
 
 
-def _obstacle(robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: np.random.Generator) -> Table | None:
-    """Return an obstacle that leaves the arm a chance, None when none was found."""
+def obstacle(
+    robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: np.random.Generator, share: float = MOVING
+) -> Table | None:
+    """Return an obstacle that leaves the arm a chance, None when none was found; share: of them that move."""
     scale = robot.reach / 0.9
     at_start, at_end = _points(robot, start), _points(robot, end)
     goal = robot.body.evaluate(end, np.zeros(robot.n), robot.points, robot.own).x[None]
@@ -119,7 +121,7 @@ def _obstacle(robot: Robot, name: str, start: F64, end: F64, lasts: float, rng: 
         where = P[int(rng.integers(len(P)))] + rng.normal(0.0, 0.08 * scale, 3)
         wxyz = rng.normal(size=4)
         table["wxyz"] = _unit(wxyz / np.linalg.norm(wxyz))
-        moving = rng.random() < MOVING
+        moving = rng.random() < share
         if moving:
             v = rng.normal(size=3)
             v *= rng.uniform(0.1, 0.5) * robot.motion.v_max / np.linalg.norm(v)
@@ -138,16 +140,16 @@ def _leaves_a_chance(robot: Robot, table: Table, at_start: F64, at_end: F64, goa
     if np.abs(table["position_m"]).max() > 50.0:
         return False
     scenario: Scenario = convert({"robot": robot.name, "duration_s": 1.0, "obstacle": [table]}, Scenario, "scene")
-    obstacle = scenario.obstacle[0]
+    told = scenario.obstacle[0]
     rho0 = robot.avoid.rho0
 
     def clear(P: F64, t: float, wide: float, radius: F64 = robot.points.radius) -> bool:
-        gap: F64 = distance(shape_of(obstacle, t), P)[0] - radius
+        gap: F64 = distance(shape_of(told, t), P)[0] - radius
         return bool(gap.min() >= wide) if len(gap) else True
 
     if not lasts:
         return clear(at_start, 0.0, rho0) and clear(at_end, 0.0, rho0)
-    speed = float(np.linalg.norm(pose_at(obstacle, 0.0).velocity))
+    speed = float(np.linalg.norm(pose_at(told, 0.0).velocity))
     wide = rho0 + robot.avoid.look_ahead * speed
     if not clear(at_end, lasts, wide):
         return False
