@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rtctl.cli import campaign, commission, experiments, init, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
-from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, RtctlError, UsageError, lacking
 
 EXAMPLES = """example:
   rtctl check configs/panda.toml
@@ -62,6 +62,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except RtctlError as error:
         return _report(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        text = lacking(error)
+        if not text:
+            raise
+        return _report(text, EXIT_USAGE)
     except OSError as error:
         got = (error.strerror or str(error)).lower()
         words = f"{error.filename}: got {got}, wanted a file that can be opened" if error.filename else got
