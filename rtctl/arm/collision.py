@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from rtctl.arm.disturbance import BANDWIDTH, LASTING, PAYLOAD_REACH, spread
+from rtctl.arm.disturbance import BANDWIDTH, GRAVITY, LASTING, PAYLOAD_REACH, spread
 from rtctl.arm.model import Model
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
@@ -28,6 +28,8 @@ FADING = 0.06  # [s] in which the law's own acceleration has come and gone
 TAKING = 2.0  # [s] in which a payload that was told is taken up or put down
 BEGIN = 0.5  # [s] of RUN in which the arm is found as it is
 CONFIRMED = 3  # ticks
+LEVER = 0.1  # [m] of all joints together, below which a weight at the tip is not felt
+HIDDEN, SLIGHT = 1.5, 3.0  # times the weight that is felt, and [N] beside it
 FELT = 0.5  # of its bound: so much of the torque counts as felt by a joint
 NO, TOUCHED, STRUCK = 0, 1, 2  # what a tick shows
 _RUN = int(State.RUN)
@@ -44,6 +46,37 @@ def inertial(J: F64, a: F64, alpha: F64, mass: float) -> F64:
         turn = math.sqrt(J[3, i] ** 2 + J[4, i] ** 2 + J[5, i] ** 2)
         out[i] = mass * (push + PAYLOAD_REACH * (lever * turning + turn * along))
     return out
+
+
+@kernel
+def swaying(J: F64, xd: F64, omega: F64, mass: float) -> F64:
+    """Return the torque (n,) [Nm] by which a mass [kg] within PAYLOAD_REACH of the tip is ahead of its track.
+
+    J (6, n); xd (3,) [m/s], omega (3,) [rad/s] of the tip. Its lever changes as it is carried and turned about, and it
+    pulls outward: m g (|xd| + r |omega|) / TRACKING + m r^2 omega^2 about each axis that turns it.
+    """
+    speed, turning = norm(xd), norm(omega)
+    lever = GRAVITY * (speed + PAYLOAD_REACH * turning) / TRACKING + (PAYLOAD_REACH * turning) ** 2
+    out = np.empty(J.shape[1])
+    for i in range(J.shape[1]):
+        out[i] = mass * lever * math.sqrt(J[3, i] ** 2 + J[4, i] ** 2 + J[5, i] ** 2)
+    return out
+
+
+@kernel
+def believable(J: F64, track: F64, payload_max: float) -> float:
+    """Return the largest payload [kg] at the tip that can be behind a lasting torque (n,) [Nm]; J (6, n).
+
+    All of the torque is taken to be its weight, and half as much again where friction hides some; where no joint feels
+    a weight, it is the one that was declared.
+    """
+    up, felt = 0.0, 0.0
+    for i in range(track.shape[0]):
+        up += J[2, i] * J[2, i]
+        felt += abs(J[2, i] * track[i])
+    if up < LEVER * LEVER:
+        return payload_max
+    return min(payload_max, (HIDDEN * felt / up + SLIGHT) / GRAVITY)
 
 
 @kernel
@@ -67,13 +100,14 @@ def _bounds(c: RecordRow, m: RecordRow, model: Model, elapsed: float) -> F64:
     """Return what the fast part of each joint (n,) [Nm] may be without a contact, beside the levels."""
     n = model.q.shape[0]
     a, alpha = _asked(m, model, elapsed)
-    may = inertial(model.J, a, alpha, c.payload_max)
+    mass = believable(model.J, m.track[:n].copy(), c.payload_max)
+    may, sways = inertial(model.J, a, alpha, mass), swaying(model.J, m.xd.copy(), m.omega.copy(), mass)
     out = spread(model.A, c.joint_r_qd[:n].copy(), BANDWIDTH)
     fade, take = math.exp(-elapsed / FADING), math.exp(-elapsed / TAKING)
     for i in range(n):
         m.unsure[i] = max(may[i], m.unsure[i] * fade)
         m.expected[i] *= take
-        out[i] += m.unsure[i] + m.expected[i] + (2.0 * c.friction_max[i] if m.steady[i] < STEADY else 0.0)
+        out[i] += m.unsure[i] + sways[i] + m.expected[i] + (2.0 * c.friction_max[i] if m.steady[i] < STEADY else 0.0)
     return out
 
 
@@ -91,8 +125,8 @@ def watch_contact(c: RecordRow, m: RecordRow, qd: F64, model: Model, elapsed: fl
         m.track[i] += (1.0 - math.exp(-rate * elapsed)) * fast[i]
         touched = touched or abs(fast[i]) > c.collision[i] + bound[i]
         struck = struck or abs(fast[i]) > c.collision_hard[i] + bound[i]
-    touched = touched and m.state == _RUN and m.floating == 0
-    if begins or not (touched or struck):
+    touched = touched and m.state == _RUN
+    if begins or m.floating != 0 or not (touched or struck):  # a hand is expected
         m.touches, m.contact_level = 0, NO
         return
     m.touches = m.touches + 1

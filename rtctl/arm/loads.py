@@ -29,6 +29,8 @@ from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, Feedback, RecordRow, State
 
+UNFELT = 2.0  # times what is noticeable: a hand that pushes a joint less than that does not move it
+GENTLE = 0.4  # of the damping of a stop: an arm that is let go comes to rest within half a second
 FINE, FINE_ROT = 1e-3, 5e-3  # [m], [rad] a goal's tolerance below them does not make the arm push on
 
 # numbers of the enumeration, as compiled code reads them
@@ -56,6 +58,11 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     external = observed(m.external[:n].copy(), model.A, qd, before, load, tau, elapsed)
     m.external[:n], m.qd_measured[:n] = external, qd
     watch_contact(c, m, qd, model, elapsed)
+    follow = 1.0 - math.exp(-FOLLOWING * elapsed)
+    drift = 1.0 - math.exp(-STICKING * elapsed)
+    for i in range(n):
+        moved = f.replies[i] > 0 and f.q[i] != m.q_previous[i]
+        m.external_moving[i] += (follow if moved else drift) * (external[i] - m.external_moving[i])
     if m.state != _RUN:
         return  # a stop goes on with what was known
     m.settled = 1 if m.floating == 0 and settled(m.settled != 0, resting, _error(c, m)) else 0
@@ -67,11 +74,6 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     least = c.noticeable[:n].copy()
     if m.noticed == 0 and beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least)):
         m.noticed = 1
-    follow = 1.0 - math.exp(-FOLLOWING * elapsed)
-    drift = 1.0 - math.exp(-STICKING * elapsed)
-    for i in range(n):
-        moved = f.replies[i] > 0 and f.q[i] != m.q_previous[i]
-        m.external_moving[i] += (follow if moved else drift) * (external[i] - m.external_moving[i])
 
 
 @kernel
@@ -90,13 +92,17 @@ def pushed(c: RecordRow, m: RecordRow, Jbar: F64, n: int) -> tuple[F64, F64]:
 
     Carried is what lasts, and known friction. An arm that floats is taken to be held by all that is external to it and
     driven by the hand: where no guard acts one is the other, and the hand moves the arm; where one acts it gives
-    against the hand what keeps the bound.
+    against the hand what keeps the bound. A touch lighter than UNFELT moves nothing, and what moves comes to rest: else
+    what is not known of the load would set an arm without friction in motion.
     """
     lasting = m.lasting[:n].copy() if m.noticed != 0 else np.zeros(n)
     coulomb, viscous = c.coulomb[:n].copy(), c.viscous_told[:n].copy()
     if m.floating != 0:
-        external = m.external[:n].copy()
-        return external - GUIDED * rubbing(coulomb, viscous, m.qd[:n].copy()), external - lasting
+        external, hand = m.external[:n].copy(), np.empty(n)
+        for i in range(n):
+            felt, zone = external[i] - lasting[i], UNFELT * c.noticeable[i]
+            hand[i] = felt - min(max(felt, -zone), zone) - GENTLE * c.stop_damping[i] * m.qd[i]
+        return external - GUIDED * rubbing(coulomb, viscous, m.qd[:n].copy()), hand
     asked = speeds_of(Jbar, m.v_ref.copy(), m.w_ref.copy())
     return lasting - rubbing(coulomb, viscous, asked), np.zeros(n)
 

@@ -42,6 +42,7 @@ from rtctl.kernel.reductions import greater, largest
 from rtctl.types import B1, F64, Feedback, LimitFlag, RecordRow, State
 from rtctl.world.primitives import Obstacles
 
+GUIDED_SURPRISE = 4.0  # times the bound of the innovation, of an arm that a hand may jerk
 REST_SPEED = 0.03  # [rad/s] a joint slower than this rests (encoders of MIT drives resolve 0.005)
 
 # numbers of the enumerations, as compiled code reads them
@@ -221,10 +222,8 @@ def detect_faults(
         m.has_goal != 0,
         m.innovation,
     )
-    k = m.counters
-    counters = counted(
-        f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]), c.safety_innovation_max
-    )
+    k, surprising = m.counters, c.safety_innovation_max * (GUIDED_SURPRISE if m.floating != 0 else 1.0)
+    counters = counted(f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]), surprising)
     bounds = Bounds(c.safety_stale_periods, c.safety_lost_periods, c.safety_feed_timeout)
     m.present = detect(f.link, evidence, counters, bounds, c.dt)
     for i in range(8):

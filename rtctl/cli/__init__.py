@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rtctl.cli import campaign, commission, experiments, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
-from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, RtctlError, UsageError, lacking
 
 EXAMPLES = """example:
   rtctl check configs/panda.toml
@@ -61,6 +61,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except RtctlError as error:
         return _report(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        text = lacking(error)
+        if not text:
+            raise
+        return _report(text, EXIT_USAGE)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         return _report(f"{place}{error.strerror or error}", EXIT_FAILED)
