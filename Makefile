@@ -6,6 +6,9 @@
 # make stress  500 random scenarios over the robots, judged by pybullet: about an hour
 # make benchmark DATA=FILE,...  problems of MotionBenchMaker, see docs/benchmark.md
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
+# make fuzz    every decoder against bytes that others choose: nine minutes
+# make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
+# make soak    a rover for a day of its own time: rate, memory and queues; some hours
 # make docs    the site of documents, into out/site
 # make lock    resolve requirements.lock anew from pyproject.toml
 
@@ -16,9 +19,10 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
+WORKERS ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench benchmark stress mutants docs install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants docs fuzz ordeal soak install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -27,7 +31,7 @@ demo-rover: install
 	$(BIN)/python -m tools.demo_rover
 
 test: install lint
-	$(BIN)/python -m pytest $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST_FLAGS)
 
 lint: install
 	$(BIN)/ruff check
@@ -46,6 +50,15 @@ benchmark: install
 
 mutants: install
 	$(BIN)/python -m tools.mutants
+
+fuzz: install
+	$(BIN)/python -m tools.fuzz
+
+ordeal: install
+	$(BIN)/python -m tools.ordeal
+
+soak: install
+	$(BIN)/python -m tools.soak --minutes 1440
 
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build

@@ -1,5 +1,6 @@
 """The error tree: start-up and user mistakes only; run-time faults are values, not exceptions."""
 
+import sys
 from importlib.util import find_spec
 
 EXIT_OK = 0
@@ -62,6 +63,32 @@ class LogError(RtctlError):
 
 class PlanError(RtctlError):
     """The planner found no way: none exists, or it did not find it within its bounds."""
+
+
+EXTRAS = {  # modules that the core does without, and the extra of the package that brings each
+    "pybullet": "sim",
+    "pybullet_data": "sim",
+    "ompl": "plan",
+    "matplotlib": "report",
+    "PIL": "report",
+    "pyarrow": "report",
+    "pymavlink": "rover",
+    "viser": "view",
+    "trimesh": "view",
+    "distributed": "campaign",
+    "dask": "campaign",
+}
+NO_BULLET = "; pybullet has no wheel for Python 3.12 and later: take Python 3.11"
+
+
+def lacking(error: ModuleNotFoundError) -> str:
+    """Return as one line what is to be installed, '' for a module that is no optional one."""
+    module = (error.name or "").partition(".")[0]
+    extra = EXTRAS.get(module)
+    if extra is None:
+        return ""
+    more = NO_BULLET if extra == "sim" and sys.version_info >= (3, 12) else ""
+    return f"{module} is not installed: this needs rtctl[{extra}]: pip install 'rtctl[{extra}]'{more}"
 
 
 def needs(extra: str, *modules: str) -> None:

@@ -1,4 +1,4 @@
-"""What `import rtctl` offers: a few names that are kept, each with its shapes and units.
+"""What `import rtctl` offers beside `rtctl.app.plan.plan`: names that are kept, each with its shapes and units.
 
 n is the number of joints, K the number of obstacle slots, N the number of ticks in a log.
 """
@@ -9,7 +9,6 @@ import numpy as np
 
 from rtctl import design
 from rtctl.app.arm_link import first_feedback
-from rtctl.app.plan import plan
 from rtctl.app.sim import simulate
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial as _initial
@@ -19,7 +18,7 @@ from rtctl.errors import ConfigError
 from rtctl.log.read.run import read_run as read
 from rtctl.types import F64
 
-__all__ = ["Robot", "initial", "load", "plan", "read", "simulate", "tick"]
+__all__ = ["Robot", "initial", "load", "read", "simulate", "tick"]
 
 
 def load(path: str | Path) -> Robot:

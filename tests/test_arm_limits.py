@@ -170,6 +170,6 @@ def test_a_command_starts_from_what_was_sent_last_as_far_as_the_oldest_echo_allo
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_rounding_of_a_shortened_step_does_not_pass_the_bound(sign):
     """0.3 / 37 times 37 is more than 0.3."""
-    bounds = TorqueBounds(np.full(N, 80.0), np.full(N, 0.3), np.zeros(N), D)
-    p = limit_torque(TorqueParts(np.zeros(N), np.full(N, sign * 37.0)), np.zeros(N), np.zeros(N), bounds, 1.0)
+    bounds = TorqueBounds(np.full(N, 80.0), np.full(N, 0.6), np.zeros(N), D)
+    p = limit_torque(TorqueParts(np.zeros(N), np.full(N, sign * 37.0)), np.zeros(N), np.zeros(N), bounds, 0.5)
     np.testing.assert_array_equal(p.tau, np.full(N, sign * 0.3))

@@ -309,7 +309,7 @@ def test_a_goal_constrains_what_was_typed(arm: Arm, words: list[str], task: Task
     ids=["unknown axis", "axis twice", "axis without direction", "no direction", "nothing"],
 )
 def test_a_part_of_a_pose_that_makes_no_sense_is_refused(arm: Arm, words: list[str], why: str, capsys: Said) -> None:
-    assert main(["goal", "0.1", "0.2", "0.3", *words]) == EXIT_FAILED
+    assert main(["goal", "0.1", "0.2", "0.3", *words]) == EXIT_USAGE
     assert why in capsys.readouterr().err
     assert arm.requests == []
 
@@ -372,9 +372,9 @@ def test_an_obstacle_is_set_from_key_value_words(arm: Arm) -> None:
     assert [(e.name, e.shape) for e in edits[1:]] == [("crate", None), ("*", None)]
 
 
-def test_an_obstacle_with_a_wrong_key_is_refused_by_the_daemon(arm: Arm, capsys: Said) -> None:
-    assert main(["obstacle", "set", "b", "sphere", "radius=1", "position_m=0,0,1"]) == EXIT_FAILED
-    assert "`radius`" in capsys.readouterr().err
+def test_an_obstacle_with_a_wrong_key_is_refused_before_anybody_is_asked(folder: Path, capsys: Said) -> None:
+    assert main(["obstacle", "set", "b", "sphere", "radius=1", "position_m=0,0,1"]) == EXIT_USAGE
+    assert "obstacle.set.radius: got an unknown name, wanted radius_m" in capsys.readouterr().err
 
 
 # -- which daemon ---------------------------------------------------------------------------------------------------
@@ -665,7 +665,7 @@ def test_only_a_strangers_lock_can_be_passed_over(name: str, code: int, capsys: 
     assert name in said
 
 
-def test_whose_lock_is_passed_over_reaches_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whose_lock_is_passed_over_reaches_the_daemon(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rtctl.app import daemon
 
     asked: list[Any] = []
@@ -675,6 +675,9 @@ def test_whose_lock_is_passed_over_reaches_the_daemon(monkeypatch: pytest.Monkey
         return EXIT_OK
 
     monkeypatch.setattr(daemon, "run", run)
-    assert main(["run", "none.toml", "--pass-lock-of", "nobody", "--pass-lock-of", "12345"]) == EXIT_OK
-    assert main(["run", "none.toml"]) == EXIT_OK
+    config = folder / "toy.toml"
+    config.write_text((ROOT / "configs" / "panda.toml").read_text())
+    monkeypatch.setattr("rtctl.cli.offline.prepare", lambda *_, **__: None)
+    assert main(["run", str(config), "--pass-lock-of", "nobody", "--pass-lock-of", "12345"]) == EXIT_OK
+    assert main(["run", str(config)]) == EXIT_OK
     assert asked == [{pwd.getpwnam("nobody").pw_uid, 12345}, frozenset()]

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from firmware_sim import codec
 from rtctl.protocol import e2e
 from rtctl.protocol.e2e import Check, Receivers, sequence
 
@@ -135,3 +136,40 @@ def test_a_frame_is_never_used_twice_in_a_row_whatever_comes(counters: list[int]
         if receiver.last[0] == counter:  # used, or taken up as the start of a drive that counts anew
             followed = counter
         assert 0 <= receiver.disorder[0] <= e2e.DISORDER_LIMIT
+
+
+def test_every_counter_after_every_other_is_judged_by_the_shorter_way_round() -> None:
+    for last in range(256):
+        for ahead in range(256):
+            found = sequence(last, (last + ahead) % 256)
+            wanted = {0: (Check.REPEATED, 0), 1: (Check.OK, 0)}
+            late = (Check.WRONGSEQUENCE, ahead - 1 if ahead < 128 else ahead - 256)
+            assert found == wanted.get(ahead, late)
+            assert found.fresh == (0 < ahead < 128)
+
+
+def test_a_new_receiver_takes_any_first_counter() -> None:
+    for counter in range(256):
+        receiver = Receivers(2)
+        assert receiver.judge(1, counter) == (Check.OK, 0)
+        assert receiver.last.tolist() == [-1, counter]
+
+
+def test_a_link_counts_as_disordered_at_five() -> None:
+    receiver = Receivers(1)
+    for counter in range(0, 100, 2):
+        receiver.judge(0, counter)
+    assert receiver.disorder[0] == e2e.DISORDER_LIMIT == 5
+
+
+def test_the_status_bits_are_those_of_the_other_end() -> None:
+    assert {bit.name: int(bit) for bit in e2e.Report} == {
+        "WATCHDOG": codec.WATCHDOG,
+        "CLAMPED": codec.CLAMPED,
+        "SLEW": codec.SLEWED,
+        "DERATED": codec.DERATED,
+        "BRAKE": codec.BRAKE,
+    }
+    assert {bit.name: int(bit) for bit in e2e.Wanted} == {"TORQUE": codec.TORQUE_WANTED}
+    assert (int(e2e.Report.NONE), int(e2e.Wanted.NONE)) == (0, 0)
+    assert len(Check) == 5  # none is another's name

@@ -24,9 +24,11 @@ from rtctl.arm.faults import (
     Bounds,
     Counters,
     Evidence,
+    SafetyParams,
     counted,
     describe,
     detect,
+    implausible_positions,
     names,
 )
 from rtctl.control.faults import GOOD_TICKS, Fault, FaultTable
@@ -219,6 +221,8 @@ outside_limits    50  SS1 R
 overspeed         50  SS1 R
 innovation        21  SS1 R {MOTION} torque
 log_degraded      51  LOG A
+collision         24  SS2 R
+collision_hard    24  SS1 R
 """
 
 
@@ -316,3 +320,68 @@ def test_a_drives_fault_is_told_with_joint_and_code():
         0xD: "communication lost",
         0xE: "overload",
     }
+
+
+# ---- how far a joint can have moved
+
+AT = {"q": 0.0, "age": DT, "replies": 1, "q_previous": 0.0, "age_previous": DT, "qd_max": 2.0}
+
+
+def implausible(elapsed: float = DT, **joint: float) -> bool:
+    """Return what is said of one joint; another beside it stands still."""
+    one = {**AT, **joint}
+    both = {key: np.array([AT[key], one[key]]) for key in AT}
+    replies = both.pop("replies").astype(np.int64)
+    out = implausible_positions(
+        both["q"], both["age"], replies, both["q_previous"], both["age_previous"], both["qd_max"], elapsed, DT
+    )
+    assert not out[0]
+    return bool(out[1])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("elapsed", "age_previous", "age", "periods"),
+    [(DT, DT, DT, 1), (3 * DT, DT, DT, 3), (DT, 3 * DT, DT, 3), (2 * DT, DT, 2 * DT, 1), (DT, DT, 5 * DT, 1)],
+)
+def test_a_position_is_implausible_beyond_one_and_a_half_of_what_the_speed_limit_allows(
+    sign: float, elapsed: float, age_previous: float, age: float, periods: int
+):
+    """Between the two measurements lie the periods that passed, more for an old one before, fewer for one now."""
+    reach = 1.5 * 2.0 * periods * DT + 0.002
+    more = {"elapsed": elapsed, "age_previous": age_previous, "age": age}
+    assert not implausible(q=0.5 + sign * reach * 0.999, q_previous=0.5, **more)
+    assert implausible(q=0.5 + sign * reach * 1.001, q_previous=0.5, **more)
+
+
+def test_a_joint_that_did_not_answer_or_tells_no_number_is_not_implausible():
+    assert implausible(q=1.0, replies=1)
+    assert implausible(q=1.0, replies=2)
+    assert not implausible(q=1.0, replies=0)
+    assert not implausible(q=np.nan)
+    assert not implausible(q=np.inf)
+
+
+def test_faults_that_clear_by_themselves_do_so_after_fifty_ticks_wherever_they_stand_in_the_table():
+    """As docs/faults.md says; the bit of each decides, not that of its neighbour."""
+    rules = "RALAR"
+    table = FaultTable.of([Fault(str(i), i, Severity.SS2, rule, "") for i, rule in enumerate(rules)])
+    everything = (1 << len(rules)) - 1
+    in_force, good = table.latch(everything, 0, np.zeros(len(rules), np.int64))
+    for _ in range(49):
+        in_force, good = table.latch(0, in_force, good)
+        assert in_force == everything
+    in_force, good = table.latch(0, in_force, good)
+    assert table.names(in_force) == tuple(str(i) for i, rule in enumerate(rules) if rule != "A")
+
+
+def test_an_observed_obstacle_may_creep_at_a_tenth_of_a_metre_in_a_second():
+    assert SafetyParams._field_defaults == {"creep": 0.1}
+
+
+def test_a_description_without_a_drives_fault_is_that_of_the_table():
+    nothing = feedback([0xE, 1])
+    for name in ("contact", "overspeed"):
+        assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP) == TABLE.describe(BIT[name], State.SAFE_STOP)
+        assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP).startswith(f"SAFE_STOP: {name}: ")
+    assert describe(0, nothing, ("a", "b"), State.RUN) == "RUN"

@@ -262,14 +262,17 @@ def test_a_stamp_counts_the_time_that_the_message_took() -> None:
 @pytest.mark.parametrize(
     ("message", "line"),
     [
-        (cloud_of(3)[:10], "not understood"),
-        (cloud_of(3)[:40], "not understood"),
-        (messages.CLOUD_MARK, "not understood"),
-        (messages.CLOUD_MARK + b"\xff\xff\xff\xff{}", "not understood"),
+        (cloud_of(3)[:10], "request: got no JSON"),
+        (cloud_of(3)[:40], "request: got no JSON"),
+        (messages.CLOUD_MARK, "request: got no JSON"),
+        (messages.CLOUD_MARK + b"\xff\xff\xff\xff{}", "request.verb: got nothing"),
         (cloud_of(3, step_m=1.0), "step_m"),
-        (cloud_of(3, more=1), "unknown field `more`"),
-        (cloud_of(3).replace(b'"position_m":[0.5,0.0,0.4]', b'"file":"/etc/shadow","x":1'), "not understood"),
-        (b'{"verb":"cloud"}', "not understood"),
+        (cloud_of(3, more=1), "cloud.more: got an unknown name, wanted"),
+        (
+            cloud_of(3).replace(b'"position_m":[0.5,0.0,0.4]', b'"file":"/etc/shadow","x":1'),
+            "cloud.set.x: got an unknown name",
+        ),
+        (b'{"verb":"cloud"}', "cloud.verb: got 'cloud', wanted"),
     ],
 )
 def test_a_cloud_that_is_not_whole_is_refused_by_a_line(message: bytes, line: str) -> None:

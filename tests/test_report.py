@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -14,6 +15,8 @@ from rtctl.log import Kind, McapSink, make_header, read
 from rtctl.log.record.requests import encode_event
 from rtctl.log.view.plot import envelope
 from rtctl.log.view.report.bins import Bins, Histogram, Spectrum
+from rtctl.log.view.report.gather import Span
+from rtctl.log.view.report.page import reached
 from tests.lab import ROOT
 from tools.browser import Browser, missing
 
@@ -50,9 +53,17 @@ def test_the_head_card_says_what_the_log_says(page: Path):
         f"{len(read(GOLDEN)['/tick'])} ticks",
         "<dt>Dropouts</dt><dd>none</dd>",
         "<dt>Ended</dt>",
+        "<dt>Slots missed</dt><dd>no deadlines: lockstep</dd>",
+        "<dt>Goals reached</dt><dd>0 of 3</dd>",
     ):
         assert words in text, words
     assert "name = &quot;panda&quot;" in text  # the config
+
+
+def test_a_goal_is_reached_once_however_often_the_tip_comes_back():
+    spans = [Span(0.0, 1.0, "moving"), *(Span(t, t + 0.1, "arrived") for t in (1.0, 1.5, 2.5, 7.0))]
+    assert reached(SimpleNamespace(asked=[0.5, 2.0, 4.0, 6.0], statuses=spans)) == 3
+    assert reached(SimpleNamespace(asked=[], statuses=spans)) == 0
 
 
 def painted(browser: Browser, selector: str) -> int:

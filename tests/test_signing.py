@@ -202,3 +202,68 @@ def test_as_many_streams_as_are_kept_are_read_and_not_one_more():
     assert len(signing.from_text("\n".join(["sent 1", *rows[:-1]])).streams) == signing.STREAMS
     with pytest.raises(ValueError, match="more streams"):
         signing.from_text("\n".join(["sent 1", *rows]))
+
+
+# ---- framing, by the bytes of the published frame formats
+
+#       magic len seq sys comp id payload crc
+V1 = bytes((0xFE, 2, 11, 12, 13, 14, 0xA1, 0xA2, 0xC1, 0xC2))
+#       magic len incompat compat seq sys comp id(3, little-endian) payload crc
+V2 = bytes((0xFD, 3, 0, 22, 23, 24, 25, 1, 2, 3, 0xB1, 0xB2, 0xB3, 0xC3, 0xC4))
+
+
+def test_the_fields_of_a_frame_are_where_the_protocol_puts_them():
+    assert cut(V1) == (V1, 1, 0, 11, 12, 13, 14)
+    assert cut(V2) == (V2, 2, 0, 23, 24, 25, 0x030201)
+    longer = V2[:2] + b"\x01" + V2[3:] + bytes(13)
+    assert cut(longer) == (longer, 2, 1, 23, 24, 25, 0x030201)
+    assert cut(longer).signed
+    assert not cut(V2).signed
+
+
+@pytest.mark.parametrize("frame", [V1, V2, V2[:2] + b"\x01" + V2[3:] + bytes(13), bytes((0xFE, 0)) + bytes(6)])
+def test_a_frame_is_cut_at_its_own_length_and_not_before(frame: bytes):
+    for whole in range(len(frame)):
+        assert signing.split(frame[:whole]) == ([], frame[:whole], 0)
+    one = cut(frame)
+    assert signing.split(frame + frame) == ([one, one], b"", 0)
+    assert signing.split(b"\x00\x01\x02" + frame + b"\x03\x04" + frame[:1]) == ([one], frame[:1], 5)
+
+
+def test_the_longest_frame_is_the_published_280_bytes():
+    longest = bytes((0xFD, 255, 1)) + bytes(7 + 255 + 2 + 13)
+    assert len(cut(longest).raw) == len(longest) == signing.LONGEST == 280
+
+
+def test_only_an_unsigned_frame_of_version_2_is_signed():
+    for raw in (V1, V2[:2] + b"\x01" + V2[3:]):
+        with pytest.raises(ValueError, match="unsigned MAVLink 2"):
+            signing.sign(raw, KEY, 0, NOTHING, NOW, EXTRA)
+    raw, state = signing.sign(V2[:2] + b"\x02" + V2[3:], KEY, 7, NOTHING, NOW, EXTRA)
+    assert (raw[2], raw[3], raw[-13]) == (3, 22, 7)  # what else was flagged stays
+    assert state.sent == NOW
+
+
+def test_a_stamp_counts_ten_microseconds_from_2015_and_is_never_below_zero():
+    assert signing.timestamp(1_420_070_400 * 10**9) == 0
+    assert signing.timestamp(1_420_070_400 * 10**9 + 25_000) == 2
+    assert signing.timestamp(0) == 0
+    assert signing.timestamp(1_420_070_401 * 10**9) == 100_000
+
+
+def test_a_new_stream_may_be_a_minute_behind_and_not_more():
+    assert signing.verify(signed(NOW - 6_000_000), KEY, NOTHING, NOW)[0] is Verdict.GOOD
+    assert signing.verify(signed(NOW - 6_000_001), KEY, NOTHING, NOW)[0] is Verdict.STALE
+
+
+def test_sixteen_streams_are_kept_and_a_known_one_still_counts():
+    sixteen = {(200 + k, 1, 0): 1 for k in range(15)} | {(1, 1, 0): 1}
+    assert signing.verify(signed(NOW), KEY, State(sixteen, 0), NOW)[0] is Verdict.GOOD
+    assert signing.verify(signed(NOW, system=9), KEY, State(sixteen, 0), NOW)[0] is Verdict.CROWDED
+    del sixteen[200, 1, 0]
+    assert signing.verify(signed(NOW, system=9), KEY, State(sixteen, 0), NOW)[0] is Verdict.GOOD
+
+
+def test_verdicts_are_nine_and_nothing_was_sent_or_heard_at_first():
+    assert len(Verdict) == 9
+    assert State({}, 0) == NOTHING

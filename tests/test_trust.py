@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -189,3 +190,14 @@ def test_a_daemon_of_ones_own_is_asked(tmp_path):
         listener.listen(1)
         assert client.answers(str(path))
         client.Session(str(path)).close()
+
+
+def test_every_line_of_the_threat_model_names_tests_that_are_there():
+    root = Path(__file__).resolve().parent.parent
+    rows = [row for row in (root / "docs" / "trust.md").read_text().splitlines() if row.startswith("| ")]
+    lines = [row for row in rows if not row.endswith("| held by |")]
+    assert len(lines) > 15
+    for line in lines:
+        named = re.findall(r"`(tests/\w+\.py)`", line)
+        assert named, line
+        assert [name for name in named if not (root / name).is_file()] == []

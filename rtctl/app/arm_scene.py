@@ -149,8 +149,11 @@ class ArmFeed:
             return ()
         self.frames = int(truth.time * CAMERA_HZ) + 1
         seen = []
+        known = {shape.name for shape in self.robot.obstacles}  # the config's own need no camera, and take none
         for edit in self.simulator.obstacles():
             old = self.last.get(edit.name)
+            if edit.name in known:
+                continue
             if edit.shape is not None and old is not None and _same_and_still(edit.shape, old):
                 continue
             self.last[edit.name] = edit.shape

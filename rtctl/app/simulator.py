@@ -3,7 +3,7 @@
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from rtctl.errors import ConfigError, RtctlError
+from rtctl.errors import ConfigError, RtctlError, UsageError, lacking
 from rtctl.spec.scenario import Scenario, scenario_dict
 from rtctl.types import Simulator
 
@@ -21,6 +21,8 @@ def open_simulator(config_path: Path, scenario: Scenario, path: str | Path) -> S
         simulator: Simulator = found["pybullet"].load()(str(config_path), play, seed=scenario.seed)
     except RtctlError:
         raise
+    except ModuleNotFoundError as error:
+        raise UsageError(lacking(error) or f"simulator: {error}") from None
     except Exception as error:  # another program's refusal: its words, not its traceback
         raise RtctlError(f"simulator: {error}") from error
     return simulator

@@ -78,9 +78,10 @@ def _mark(config: Path) -> Path:
 def _made(since: float) -> int:
     """Return how many kernels were written to the caches since a time [s]."""
     count = 0
-    for path in folder().glob("rtctl.*/*/*.nbi"):
-        with suppress(OSError):
-            count += path.stat().st_mtime >= since
+    with suppress(OSError):  # another process may clear old caches away meanwhile
+        for path in folder().glob("rtctl.*/*/*.nbi"):
+            with suppress(OSError):
+                count += path.stat().st_mtime >= since
     return count
 
 

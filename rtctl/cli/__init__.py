@@ -5,9 +5,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from rtctl.cli import campaign, commission, experiments, logs, offline, operate, page, plan
+from rtctl.cli import campaign, commission, experiments, init, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
-from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, RtctlError, UsageError, lacking
 
 EXAMPLES = """example:
   rtctl check configs/panda.toml
@@ -34,6 +34,7 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
+    init.add(commands)
     offline.add_before(commands)
     commission.add(commands)
     operate.add(commands)
@@ -61,9 +62,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except RtctlError as error:
         return _report(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        text = lacking(error)
+        if not text:
+            raise
+        return _report(text, EXIT_USAGE)
     except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        return _report(f"{place}{error.strerror or error}", EXIT_FAILED)
+        got = (error.strerror or str(error)).lower()
+        words = f"{error.filename}: got {got}, wanted a file that can be opened" if error.filename else got
+        return _report(words, EXIT_FAILED)
 
 
 def _run(argv: list[str]) -> int:

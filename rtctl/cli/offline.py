@@ -118,10 +118,12 @@ def _check(arguments: argparse.Namespace) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     passing = frozenset(_stranger(name) for name in arguments.pass_lock_of)
     with ExitStack() as stack:
+        _refuse_scenario(arguments.config)
         lobby = _lobby(arguments.config)
         if lobby is not None:
             stack.enter_context(lobby)
             print(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", file=sys.stderr, flush=True)
+        _refuse_config(arguments.config)
         prepare(arguments.config, lobby=lobby)
         from rtctl.app.daemon import run
 
@@ -133,6 +135,23 @@ def _run(arguments: argparse.Namespace) -> int:
             passing=passing,
             lobby=lobby,
         )
+
+
+def _refuse_scenario(config: str) -> None:
+    """Refuse at once what is no robot's file, before anything is compiled for it. Raises ConfigError."""
+    from rtctl.spec.read import refuse_scenario
+
+    refuse_scenario(Path(config))
+
+
+def _refuse_config(config: str) -> None:
+    """Refuse a file that contradicts itself before minutes are spent on compiling for it. Raises ConfigError."""
+    from rtctl import design
+
+    if design.is_base(config):
+        design.load_base(config)
+    else:
+        design.load(config)
 
 
 def _lobby(config: str) -> "Lobby | None":

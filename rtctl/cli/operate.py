@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 from rtctl.cli.parser import Commands, Parser, add_daemon, command, daemon_of, number, positive
-from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, RequestError, UsageError
 from rtctl.plain import Json
 
 if TYPE_CHECKING:
@@ -177,7 +177,9 @@ def _set(arguments: argparse.Namespace) -> int:
     described = {"name": arguments.name, "type": arguments.type, **assignments(arguments.keys)}
     if arguments.type == "cloud":
         return _set_cloud(arguments, described)
-    return _said(_demand(arguments, {"verb": "obstacle", "set": described}), f"obstacle {arguments.name}: set")
+    message = {"verb": "obstacle", "set": described}
+    _checked(message)
+    return _said(_demand(arguments, message), f"obstacle {arguments.name}: set")
 
 
 def _set_cloud(arguments: argparse.Namespace, described: Json) -> int:
@@ -232,12 +234,23 @@ def _goal(arguments: argparse.Namespace) -> int:
     message |= {key: value for key, value in asked.items() if value is not None}
     if arguments.hold_orientation:
         message["hold"] = "orientation"
+    _checked(message)
     if arguments.no_wait:
         return _said(_demand(arguments, message), "goal: accepted")
     with ready_session(arguments, "goal") as session:
         outcome: Outcome = send_and_wait(session, message, arguments.timeout)
     outcome.show(arguments.json)
     return EXIT_OK if outcome.arrived else EXIT_FAILED
+
+
+def _checked(message: Json, place: str = "") -> None:
+    """Refuse, before anybody is asked, what no daemon would take. Raises UsageError."""
+    from rtctl.hal.messages import checked  # loads what takes half a second
+
+    try:
+        checked(message)
+    except RequestError as error:
+        raise UsageError(f"{place}{error}") from None
 
 
 def _place(arguments: argparse.Namespace) -> Json:
@@ -247,26 +260,29 @@ def _place(arguments: argparse.Namespace) -> Json:
             raise UsageError("goal: got X Y and --latlon, wanted one of them")
         return {"latlon_deg": arguments.latlon}
     if arguments.z is None:  # also of a base: a Z forgotten must not send an arm to the floor
-        raise UsageError("goal: wanted X Y Z, or --latlon LAT LON")
+        count = sum(value is not None for value in (arguments.x, arguments.y))
+        raise UsageError(f"goal: got {count} numbers, wanted X Y Z [m], or --latlon LAT LON [deg]")
     return {"position_m": [arguments.x, arguments.y, arguments.z]}
 
 
 def _goals(arguments: argparse.Namespace) -> int:
     from rtctl.cli import missions
     from rtctl.cli.goals import run_stream
+    from rtctl.cli.values import goal_messages
     from rtctl.cli.waiting import ready_session
 
     if arguments.file != "-" and not os.path.isfile(arguments.file):
         raise UsageError(f"{arguments.file}: got no such file, wanted one of goals, or - for standard input")
-    with ready_session(arguments, "goals") as session:
-        if arguments.file == "-":
+    if arguments.file == "-":
+        with ready_session(arguments, "goals") as session:
             return run_stream(session, sys.stdin, "stdin", arguments)
-        with open(arguments.file, encoding="utf-8", errors="replace") as lines:
-            text = lines.read(MISSION_MAX)
-            if missions.is_mission(text):
-                return run_stream(session, missions.goals_of(text, arguments.file), arguments.file, arguments)
-            lines.seek(0)
-            return run_stream(session, lines, arguments.file, arguments)
+    with open(arguments.file, encoding="utf-8", errors="replace") as file:
+        text = file.read(MISSION_MAX)
+        lines = missions.goals_of(text, arguments.file) if missions.is_mission(text) else text.splitlines()
+    for at, message in goal_messages(lines, arguments.file):
+        _checked(message, f"{arguments.file}:{at}: ")
+    with ready_session(arguments, "goals") as session:
+        return run_stream(session, lines, arguments.file, arguments)
 
 
 def _status(arguments: argparse.Namespace) -> int:

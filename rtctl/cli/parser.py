@@ -39,7 +39,7 @@ class Parser(argparse.ArgumentParser):
             self.error(f"got {' '.join(rest)} beyond what the command takes, wanted nothing more")
         return found, rest
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
+    def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             names = [str(choice) for choice in action.choices]
             raise argparse.ArgumentError(action, f"got {value!r}, wanted {nearest(str(value), names)}")
@@ -115,7 +115,7 @@ def add_daemon(parser: Parser) -> None:
     )
 
 
-def _robots(**_: Any) -> list[str]:
+def _robots(**_: object) -> list[str]:
     """Return the names that a shell may complete --robot to."""
     from pathlib import Path
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from rtctl.cli.parser import Commands, command, log_file, number
 from rtctl.cli.progress import bar
 from rtctl.errors import EXIT_OK, UsageError
+from rtctl.spell import nearest
 
 FORMATS = ("csv", "parquet", "candump", "blf", "tlog")
 ENDINGS = {".csv": "csv", ".parquet": "parquet", ".log": "candump", ".blf": "blf", ".tlog": "tlog"}
@@ -72,7 +73,7 @@ def _export(arguments: argparse.Namespace) -> int:
         topic = run.window(arguments.topic, 0, 0)
         for name in names:
             if topic.dtype is not None and name not in topic.fields:
-                raise UsageError(f"--fields: got {name!r}, wanted some of {', '.join(topic.fields)}")
+                raise UsageError(f"--fields: got {name!r}, wanted {nearest(name, topic.fields, len(topic.fields))}")
     else:
         total = sum(run.count(name) for name in (export.buses(run) if kind != "tlog" else ()))
     with bar(f"writing {kind}", total) as progress:

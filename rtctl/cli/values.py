@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from rtctl.errors import UsageError
 from rtctl.plain import Json
+from rtctl.spell import close_to
 
 COLUMNS = {3: ("x", "y", "z"), 6: ("x", "y", "z", "roll", "pitch", "yaw"), 7: ("x", "y", "z", "qw", "qx", "qy", "qz")}
 GROUPS = {
@@ -29,9 +30,9 @@ def assignments(words: Iterable[str]) -> Json:
     for word in words:
         key, equals, text = word.partition("=")
         if not (key and equals and text):
-            raise UsageError(f"got {word!r}, wanted KEY=VALUE")
+            raise UsageError(f"KEY=VALUE: got {word!r}, wanted a key, = and a value")
         if key in found or key in ("name", "type"):
-            raise UsageError(f"{key}: given twice")
+            raise UsageError(f"{key}: got it twice, wanted it once")
         found[key] = _value(key, text)
     return found
 
@@ -69,7 +70,7 @@ def _from_json(text: str, place: str) -> Json:
     try:
         goal = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"{place}: {error}") from None
+        raise UsageError(f"{place}: got no JSON ({error}), wanted one JSON object") from None
     if not any(key in goal for key in NEEDED):
         raise UsageError(f"{place}: got no goal, wanted one of {', '.join(NEEDED)}")
     return {**goal, "verb": "goal"}
@@ -79,7 +80,9 @@ def _header(cells: list[str], place: str) -> tuple[str, ...]:
     names = tuple(cells)
     odd = [name for name in names if name not in KNOWN]
     if odd or len(set(names)) != len(names):
-        raise UsageError(f"{place}: got {odd[0] if odd else 'a name twice'}, {WANTED}")
+        near = close_to(odd[0], KNOWN) if odd else ""
+        wanted = f"wanted {near} (the nearest valid name)" if near else WANTED
+        raise UsageError(f"{place}: got {odd[0] if odd else 'a name twice'}, {wanted}")
     return names
 
 

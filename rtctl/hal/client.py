@@ -187,8 +187,8 @@ def _connect(path: str, timeout: float) -> socket.socket:
             return link
         link.close()
         if code != errno.EAGAIN or time.monotonic() >= deadline:
-            what = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "no daemon is listening"}
-            raise LinkError(f"{path}: {what.get(code, os.strerror(code))}")
+            what = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "a socket on which no daemon is listening"}
+            raise LinkError(f"{path}: got {what.get(code, os.strerror(code).lower())}, wanted that of a running daemon")
         time.sleep(RETRY)
 
 

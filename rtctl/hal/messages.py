@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rtctl.arm.task import point_of, within
-from rtctl.errors import RequestError
+from rtctl.errors import ConfigError, RequestError
 from rtctl.plain import Json
 from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
 from rtctl.spec.obstacles import (
@@ -30,6 +30,7 @@ from rtctl.spec.obstacles import (
     contradiction,
     shape_of,
 )
+from rtctl.spec.read import convert, type_info
 from rtctl.spec.robot import Angles
 from rtctl.types import Goal, ObstacleEdit, Payload, Request, Task, Verb
 
@@ -187,6 +188,7 @@ VERBS = {
     Hold: Verb.HOLD,
 }
 
+KNOWN = frozenset(str(t.tag) for t in type_info(Message).types) | {"cloud"}
 _decoder = msgspec.json.Decoder(Message, strict=True)
 _cloud_decoder = msgspec.json.Decoder(CloudMessage, strict=True)
 
@@ -215,12 +217,38 @@ def decode(raw: bytes | memoryview) -> Message | CloudFrame:
     try:
         message: Message = _decoder.decode(raw)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise RequestError(f"not understood: {error}") from None
+        raise RequestError(_explained(bytes(raw), Message, error)) from None
     for path, obstacle in _obstacles(message):
         if isinstance(obstacle, Cloud):
             raise RequestError(f"{path}: a cloud comes as a binary message; rtctl obstacle set sends one from a file")
         _refuse(path, obstacle)
     return message
+
+
+def checked(message: Json) -> None:
+    """Refuse a message that no daemon would take, whatever its robot and state. Raises RequestError."""
+    found = decode(msgspec.json.encode(message))
+    if isinstance(found, GoalMessage):
+        _refuse_goal(found)
+
+
+def _explained(raw: bytes, kind: object, error: Exception) -> str:
+    """Return why a message is refused: the place in it, what came, what was wanted."""
+    try:
+        data = msgspec.json.decode(raw)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        words = str(error).removeprefix("JSON is malformed: ").removeprefix("Input data was truncated")
+        return f"request: got no JSON ({words or 'it is cut short'}), wanted one JSON object"
+    if not isinstance(data, dict):
+        return "request: got no object, wanted one JSON object with a verb"
+    verb = data.get("verb")
+    try:
+        convert(data, kind, verb if isinstance(verb, str) and verb in KNOWN else "request")
+    except ConfigError as refusal:
+        return f"{refusal.place.replace(': ', '.', 1)}: got {refusal.got}, wanted {refusal.wanted}"
+    except RecursionError:
+        return "request: got lists or tables nested too deep, wanted a few levels"
+    return f"request: got what JSON has no value for ({error}), wanted finite numbers and known names"
 
 
 def _cloud_of(raw: bytes) -> CloudFrame:
@@ -230,7 +258,7 @@ def _cloud_of(raw: bytes) -> CloudFrame:
     try:
         header = _cloud_decoder.decode(raw[start : start + length])
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise RequestError(f"not understood: {error}") from None
+        raise RequestError(_explained(raw[start : start + length], CloudMessage, error)) from None
     _refuse("cloud.set", header.set)
     return CloudFrame(header, raw[start + length :])
 
@@ -241,7 +269,7 @@ def _refuse(path: str, obstacle: Obstacle) -> None:
         key, got, wanted = found
         raise RequestError(f"{path}.{key}: got {got}, wanted {wanted}")
     if obstacle.waypoints or obstacle.appears_s != 0.0 or obstacle.vanishes_s != 1e6:
-        raise RequestError(f"{path}: a timetable belongs in a scenario; say where the obstacle is now")
+        raise RequestError(f"{path}: got a timetable, wanted where it is now: a timetable belongs in a scenario")
     if isinstance(obstacle, Mesh | Cloud) and obstacle.file is not None:
         # the daemon opens no file that a peer names: it may run as another user, and must not wait for a disk
         raise RequestError(f"{path}.file: got {obstacle.file!r}, wanted mesh = the name of a [[mesh]] of the config")
@@ -319,6 +347,12 @@ def _age(message: ObstacleMessage | ObstaclesMessage | CloudMessage, now: float)
     return age
 
 
+def _refuse_goal(message: GoalMessage) -> None:
+    if found := goal_contradiction(message):
+        key, got, wanted = found
+        raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
+
+
 def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Sequence[float]]) -> Goal:
     if message.latlon_deg is not None:
         message = msgspec.structs.replace(message, position_m=_position_of(message, bounds), latlon_deg=None)
@@ -326,9 +360,7 @@ def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Seq
         raise RequestError(f"goal.tolerance_m: got {message.tolerance_m}, wanted at most {ARM_TOLERANCE}")
     if bounds.local is None and message.heading_rad is not None:
         raise RequestError(f"goal.heading_rad: got {message.heading_rad}, wanted rpy_rad or wxyz: {HEADING}")
-    if found := goal_contradiction(message):
-        key, got, wanted = found
-        raise RequestError(f"goal.{key}: got {got}, wanted {wanted}")
+    _refuse_goal(message)
     goal = goal_from(message, lambda: np.array(orientation()), bounds.tolerance, bounds.tolerance_rot)
     if message.posture_rad is not None:
         goal = goal._replace(posture=np.array(message.posture_rad, dtype=np.float64))

@@ -16,7 +16,7 @@ from rtctl.protocol.mavlink_budget import MOST, SCANS, Streams, baud_of, fitted
 from rtctl.protocol.signing import KEY
 from rtctl.rover.occupancy import CELL, STENCIL
 from rtctl.spec.obstacles import Name, Obstacle, refuse_obstacles
-from rtctl.spec.read import convert, name_place, parse
+from rtctl.spec.read import name_place, parse, read
 from rtctl.spec.robot import ConsoleTable, LogTable, Table, Text
 from rtctl.spec.rules import Found
 
@@ -189,7 +189,7 @@ def is_base(path: str | Path) -> bool:
 
 def load(path: str | Path) -> BaseConfig:
     """Return the checked config of a base's TOML file. Raises ConfigError as the arm's `load`."""
-    config: BaseConfig = convert(parse(Path(path)), BaseConfig, str(path))
+    config: BaseConfig = read(Path(path), BaseConfig)
     for group in (_shape, _link, _rates, _distances):
         for found in group(config):
             raise ConfigError(name_place(str(path), found.path), found.got, found.wanted)

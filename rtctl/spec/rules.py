@@ -13,6 +13,7 @@ from rtctl.spec.bus import LOAD_MAX, Load, cycle_load
 from rtctl.spec.obstacles import orientation_contradiction, refuse_obstacles
 from rtctl.spec.read import name_place
 from rtctl.spec.robot import Config, Joint
+from rtctl.spell import nearest
 
 
 class Found(NamedTuple):
@@ -99,11 +100,11 @@ def _names(c: Config) -> Iterator[Found]:
 
 
 def _drives(c: Config) -> Iterator[Found]:
-    known = ", ".join([*c.drives, *mit.DRIVES])
+    known = [*c.drives, *mit.DRIVES]
     for i, joint in enumerate(c.robot.joints):
         at, scale = f"robot.joints[{i}].", scale_of(c, joint.drive)
         if scale is None:
-            yield Found(at + "drive", joint.drive, f"one of {known}; or a table [drives.{joint.drive}]")
+            yield Found(at + "drive", joint.drive, f"{nearest(joint.drive, known)}; or a table [drives.{joint.drive}]")
             continue
         of = f"of drive {joint.drive}"
         if joint.q_min_rad >= joint.q_max_rad:

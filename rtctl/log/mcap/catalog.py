@@ -92,7 +92,7 @@ def catalog(data: Source) -> Catalog:
     """
     start, end = has_magic(data, len(data))
     if not start:
-        raise Damaged("not an MCAP file: it does not start with the magic bytes")
+        raise Damaged("a file that is no MCAP log: it does not start with the magic bytes")
     if end:
         found = _from_summary(data)
         if found is not None:

@@ -22,6 +22,7 @@ from rtctl.log.mcap.walk import (
 from rtctl.log.read.chunks import ChunkReader
 from rtctl.log.read.topic import Part, Topic
 from rtctl.plain import Json
+from rtctl.spell import nearest
 from rtctl.types import I64
 
 T = TypeVar("T")
@@ -37,7 +38,7 @@ class Log:
         try:
             self._catalog: Catalog = catalog(data)
         except Damaged as error:
-            raise LogError(f"{path}: {error}") from None
+            raise LogError(f"{path}: got {error}, wanted a log (.mcap)") from None
         self._damaged = set[int]() if damaged is None else damaged  # where their records begin
         self._chunks = ChunkReader(data, self._catalog, self._damaged)
         self._topics: dict[str, Topic] = {}
@@ -78,7 +79,7 @@ class Log:
         for channel in self._catalog.channels.values():
             if channel.topic == topic:
                 return channel, self._catalog.schemas.get(channel.schema_id)
-        raise LogError(f"{self.path}: no topic {topic}; it has {', '.join(self.topics)}")
+        raise LogError(f"{self.path}: got topic {topic}, wanted {nearest(topic, self.topics)}")
 
     def schema_of(self, topic: str) -> str:
         """Return the name of a topic's schema, or its encoding when it has none."""
@@ -238,7 +239,7 @@ class Log:
     def _topic(self, name: str, among: slice, loose: bool, start: int = 0, stop: int = I64_MAX) -> Topic:
         ids = [i for i, channel in self._catalog.channels.items() if channel.topic == name]
         if not ids:
-            raise LogError(f"{self.path}: no topic {name}; it has {', '.join(self.topics)}")
+            raise LogError(f"{self.path}: got topic {name}, wanted {nearest(name, self.topics)}")
         channel = self._catalog.channels[ids[0]]
         kind = self._catalog.schemas.get(channel.schema_id)
         schema_name = kind.name if kind else ""
@@ -261,13 +262,14 @@ def read(path: Path | str, damaged: set[int] | None = None) -> Log:
     path = Path(path)
     try:
         if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would not even let itself be opened
-            raise ValueError("not a file")
+            raise ValueError("no file")
         with path.open("rb") as file:
             # a file that is being written may be cut short by its writer, which a map would not survive
             mapped = path.suffix != OPEN and path.stat().st_size > 0
             data: Source = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if mapped else file.read()
     except (OSError, ValueError) as error:
-        raise LogError(f"{path}: {error}") from None
+        why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise LogError(f"{path}: got {why.lower()}, wanted a log (.mcap)") from None
     return Log(path, data, damaged)
 
 

@@ -15,6 +15,7 @@ from rtctl.log.mcap.walk import I64_MAX
 from rtctl.log.read.reader import Log, read
 from rtctl.log.read.topic import Part, Topic
 from rtctl.plain import Json
+from rtctl.spell import nearest
 
 T = TypeVar("T")
 OPEN_AT_ONCE = 16  # files of a run
@@ -131,7 +132,7 @@ class Run:
         """
         having = [k for k, each in enumerate(self.contents) if topic in each.topics]
         if not having:
-            raise LogError(f"{self.path}: no topic {topic}; it has {', '.join(self.topics)}")
+            raise LogError(f"{self.path}: got topic {topic}, wanted {nearest(topic, self.topics)}")
         first = self.logs[having[0]].window(topic, start, stop)
         if len(having) == 1:
             return first

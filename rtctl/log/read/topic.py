@@ -14,6 +14,7 @@ from rtctl.log import limits, schema
 from rtctl.log.mcap.walk import Source, rows_of
 from rtctl.log.schema import Layout, can_layout, tick_layout
 from rtctl.plain import Json
+from rtctl.spell import nearest
 from rtctl.types import I64, U8, Array
 
 OBJECT = 64  # [bytes] that a message costs beside its own, once it is an object
@@ -107,7 +108,7 @@ class Topic:
         """
         known = self.fields
         if name not in known:
-            raise LogError(f"{self.name} has no field {name}; it has {', '.join(known)}")
+            raise LogError(f"{self.name}: got field {name}, wanted {nearest(name, known)}")
         if self.dtype is None:
             return np.ascontiguousarray(self.array[name])
         return self._ticks.field(name)
@@ -125,7 +126,7 @@ class Topic:
         if self.dtype is not None:
             odd = [name for name in names if name not in self.fields]
             if odd:
-                raise LogError(f"{self.name} has no field {odd[0]}; it has {', '.join(self.fields)}")
+                raise LogError(f"{self.name}: got field {odd[0]}, wanted {nearest(odd[0], self.fields)}")
             self._ticks.load(names)
         return self
 

@@ -15,6 +15,7 @@ from rtctl.log.read.fields import FIELDS, unit_of
 from rtctl.log.read.run import Run
 from rtctl.log.read.topic import Structured, Topic
 from rtctl.log.view.mavlink import packets
+from rtctl.spell import nearest
 from rtctl.types import I64
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def columns(topic: Topic, names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the fields asked for, all if none. Raises LogError for one that the topic does not have."""
     for name in names:
         if name not in topic.fields:
-            raise LogError(f"{topic.name} has no field {name}; it has {', '.join(topic.fields)}")
+            raise LogError(f"{topic.name}: got field {name}, wanted {nearest(name, topic.fields)}")
     return names or topic.fields
 
 

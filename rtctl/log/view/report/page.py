@@ -226,6 +226,13 @@ def _histogram(h: Histogram) -> Json:
 # ---- the parts that need no script
 
 
+def reached(g: Gathered) -> int:
+    """Return how many of the goals that were asked for were reached before the next one was asked."""
+    starts = [span.start for span in g.statuses if span.name == "arrived"]
+    until = [*g.asked[1:], np.inf]
+    return sum(any(a <= t < b for t in starts) for a, b in zip(g.asked, until, strict=False))
+
+
 def _head(run: Run, g: Gathered) -> str:
     f = g.figures
     sentinel = run.sentinel
@@ -233,17 +240,18 @@ def _head(run: Run, g: Gathered) -> str:
     ended = str(sentinel.get("reason", "")) or "cut off: nothing says why"
     faults = sorted({s.name for s in g.faults})
     near = f["smallest_clearance_m"]
-    arrived = sum(s.name == "arrived" for s in g.statuses)
+    lockstep = g.lateness.largest == 0.0
+    missed = "no deadlines: lockstep" if lockstep else str(f["missed"])
     rows = [
         ("Duration", f"{f['duration_s']:.2f} s, {f['ticks']} ticks", False),
         ("Ended", ended, not sentinel),
         ("Faults", ", ".join(faults) or "none", bool(faults)),
         ("Dropouts", f"{dropped} entries" if dropped else "none", bool(dropped)),
-        ("Slots missed", str(f["missed"]), f["missed"] > 0),
-        ("Arrivals", str(arrived), False),
+        ("Slots missed", missed, f["missed"] > 0),
+        ("Goals reached", f"{reached(g)} of {len(g.asked)}", False),
         ("Path of the tip", f"{f['path_m']:.2f} m", False),
         ("Top speed", f"{f['top_speed_m_s']:.3f} m/s", False),
-        ("Smallest clearance", "-" if near is None else f"{near * 1e3:.1f} mm", near is not None and near <= 0.0),
+        ("Clearance by spheres", "-" if near is None else f"{near * 1e3:.1f} mm", near is not None and near <= 0.0),
         ("Largest torque", f"{f['largest_torque_Nm']:.1f} Nm", False),
         ("Final error", f"{f['final_error_m'] * 1e3:.2f} mm", False),
         ("Turn, p99 / largest", f"{g.compute.quantile(0.99) * 1e6:.0f} / {g.compute.largest * 1e6:.0f} µs", False),

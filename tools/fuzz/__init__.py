@@ -1,0 +1,1 @@
+"""Bytes that others choose, given to whatever takes them."""

@@ -1,0 +1,1 @@
+"""An ordeal: a daemon and its drives among kills, stops, vanishing peers, full disks and broken connections."""
