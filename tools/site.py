@@ -20,4 +20,4 @@ def on_page_markdown(markdown: str, **about: Any) -> str:
 
 def _shown(text: str) -> str:
     text = BLOCK.sub(lambda m: convert(m[1].strip(), display="block").replace("\n", " "), text)
-    return INLINE.sub(lambda m: convert(m[1].strip()), text)
+    return INLINE.sub(lambda m: f"<span>{convert(m[1].strip())}</span>", text)  # a bare one at a line begins a block
