@@ -82,6 +82,7 @@ $(WARM): $(shell find rtctl -name '*.py') | $(INSTALLED)
 	@touch $@
 
 lock: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-tools
 	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/python -m piptools compile --quiet --upgrade --generate-hashes \
 		--strip-extras --allow-unsafe --extra test --extra campaign --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		--output-file requirements.lock pyproject.toml
