@@ -105,6 +105,8 @@ def parse(text: str, names: Sequence[str]) -> Fault:
     """Read `kind@t[:joint[:duration]]`; SettingsError says what would have been right."""
     kind, _, rest = text.partition("@")
     parts = rest.split(":")
+    if kind == "push":
+        raise SettingsError(f"--inject {text}: a push wants link and newton: give it in a scenario's [[fault]]")
     try:
         duration = float(parts[2]) if len(parts) > 2 else None
         return _fault(kind, float(parts[0]), parts[1] if len(parts) > 1 else None, duration, names)

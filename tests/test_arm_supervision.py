@@ -29,8 +29,10 @@ def swing(arm: Standing, ticks: int) -> None:
 
 
 def idle(q: np.ndarray = PANDA_HOME) -> Standing:
-    """Return an arm whose estimator is not surprised that it moves without getting anywhere."""
-    arm = Standing(State.IDLE, q, prepared(robot()._replace(safety=robot().safety._replace(innovation_max=1e9))))
+    """Return an arm whose detectors are not surprised that it moves without getting anywhere."""
+    panda, never = robot(), np.full(7, 1e9)
+    calm = panda._replace(safety=panda.safety._replace(innovation_max=1e9), collision=never, collision_hard=never)
+    arm = Standing(State.IDLE, q, prepared(calm))
     arm.tick()
     return arm
 

@@ -157,7 +157,7 @@ def test_the_console_takes_a_heading_beside_metres_or_degrees():
     [
         ('"position_m": [3, 4, 0], "heading_rad": 1, "rpy_rad": [0, 0, 1]', BOUNDS, "no other orientation beside it"),
         ('"heading_rad": 1', BOUNDS, "wanted a position"),
-        ('"position_m": [3, 4, 0], "heading_rad": 7', BOUNDS, "<= 6.3"),
+        ('"position_m": [3, 4, 0], "heading_rad": 7', BOUNDS, "wanted a number from -6.3 to 6.3 rad"),
         ('"position_m": [3, 4, 0], "heading_rad": 1', BOUNDS._replace(local=None), "wanted rpy_rad or wxyz"),
     ],
 )

@@ -57,7 +57,6 @@ def test_two_workers_of_which_one_is_killed_give_what_one_process_gives(tmp_path
     assert set(one) == set(two) == set(range(6))
     assert [one[k]["digest"] for k in range(6)] == [two[k]["digest"] for k in range(6)]
     assert all(one[k]["digest"] for k in range(6))
-    assert len({row["worker"] for row in two.values()}) >= 2
     assert plays(tmp_path / "a") == dict.fromkeys(range(6), 1)
 
 

@@ -1,13 +1,11 @@
 """`rtctl run`: the servo process. One thread, one absolute grid; all that is slow happens elsewhere."""
 
 import json
-import os
-import select
 import signal
 import time
 import traceback
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import FrameType
 from typing import Generic, NamedTuple, Protocol
@@ -24,6 +22,7 @@ from rtctl.hal.client import default_path
 from rtctl.hal.clock import Slot
 from rtctl.hal.console import Console
 from rtctl.hal.lobby import Lobby
+from rtctl.hal.say import say
 from rtctl.hal.service import InstanceLock, Service
 from rtctl.log.header import Header
 from rtctl.log.record.recorder import Recorder, Stats
@@ -52,14 +51,6 @@ class Signals:
         waits = self.count > 0
         self.count -= waits
         return waits
-
-
-def say(text: str, to: int = 1) -> None:
-    """Print a line if that does not block: a terminal that is stopped must not stop the arm."""
-    line = (text + "\n").encode()
-    if select.select([], [to], [], 0.0)[1]:
-        with suppress(OSError):
-            os.write(to, line[-4096:])  # PIPE_BUF: what a writable pipe is sure to take
 
 
 def run(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from rtctl.cli import page
 from rtctl.cli.parser import Commands, command, positive
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
+from rtctl.hal.say import ERR, say
 from rtctl.plain import Json
 from rtctl.spec.shipped import shipped
 
@@ -122,7 +123,7 @@ def _run(arguments: argparse.Namespace) -> int:
         lobby = _lobby(arguments.config)
         if lobby is not None:
             stack.enter_context(lobby)
-            print(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", file=sys.stderr, flush=True)
+            say(f"rtctl: starting {lobby.robot}; {lobby.path} answers already", ERR)
         _refuse_config(arguments.config)
         prepare(arguments.config, lobby=lobby)
         from rtctl.app.daemon import run
@@ -237,7 +238,7 @@ def prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> 
 
     if not Path(config).is_file() or not warm.needed(config):
         return
-    print("rtctl: compiling what is not compiled yet; it is kept for the next time", file=sys.stderr, flush=True)
+    say("rtctl: compiling what is not compiled yet; it is kept for the next time", ERR)
     from rtctl.cli.progress import bar
 
     total, printed = warm.kernels(), time.monotonic()
@@ -249,7 +250,7 @@ def prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> 
             lobby.tell("compiling what is not compiled yet", done, total)
         if not sys.stderr.isatty() and time.monotonic() - printed > 5.0:
             printed = time.monotonic()
-            print(f"rtctl: compiled {done} of at most {total} kernels", file=sys.stderr, flush=True)
+            say(f"rtctl: compiled {done} of at most {total} kernels", ERR)
 
     try:
         with bar("compiling", total) as draw:

@@ -229,7 +229,8 @@ def checked(message: Json) -> None:
     """Refuse a message that no daemon would take, whatever its robot and state. Raises RequestError."""
     found = decode(msgspec.json.encode(message))
     if isinstance(found, GoalMessage):
-        _refuse_goal(found)
+        on_earth = found.latlon_deg is not None and found.position_m is None  # where that is the daemon knows alone
+        _refuse_goal(msgspec.structs.replace(found, position_m=(0.0, 0.0, 0.0)) if on_earth else found)
 
 
 def _explained(raw: bytes, kind: object, error: Exception) -> str:

@@ -38,6 +38,7 @@ STATUSES = {
     "limited": "A joint is at its limit.",
     "unreachable": "The goal is out of reach.",
     "escaping": "Going round what blocks the way.",
+    "floating": "A hand may move the arm.",
     "blind": "It waits: the way has not been seen.",
 }
 
