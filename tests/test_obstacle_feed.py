@@ -265,7 +265,7 @@ def test_a_stamp_counts_the_time_that_the_message_took() -> None:
         (cloud_of(3)[:10], "request: got no JSON"),
         (cloud_of(3)[:40], "request: got no JSON"),
         (messages.CLOUD_MARK, "request: got no JSON"),
-        (messages.CLOUD_MARK + b"\xff\xff\xff\xff{}", "request.verb: got nothing"),
+        (messages.CLOUD_MARK + b"\xff\xff\xff\xff{}", "request.set: got nothing"),
         (cloud_of(3, step_m=1.0), "step_m"),
         (cloud_of(3, more=1), "cloud.more: got an unknown name, wanted"),
         (
