@@ -13,11 +13,11 @@ import pytest
 from rtctl.app.queue import QUEUED, GoalQueue
 from rtctl.cli import main
 from rtctl.cli.offline import _missed
-from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, RequestError
 from rtctl.hal.client import Session, answers
 from rtctl.hal.console import Console
 from rtctl.hal.lobby import Lobby
-from rtctl.hal.messages import Bounds
+from rtctl.hal.messages import Bounds, decode, request_of
 from rtctl.types import Goal, ObstacleEdit, Request, State, Task, Verb
 
 BOUNDS = Bounds((0.0, 0.0, 0.0), 1.0, 0.003, 0.015)
@@ -215,3 +215,13 @@ def test_a_newer_goal_takes_the_place_of_one_that_waits(queue: GoalQueue) -> Non
 )
 def test_a_simulation_fails_by_a_goal_that_was_missed_or_a_touch(result: dict[str, Any], words: str) -> None:
     assert _missed(result) == words
+
+
+@pytest.mark.parametrize(("now", "taken"), [(9.9, True), (10.0, True), (10.5, False)])
+def test_a_request_whose_caller_has_given_up_is_refused(now: float, taken: bool) -> None:
+    message = decode(b'{"verb": "arm", "by_s": 10.0}')
+    if taken:
+        assert request_of(message, BOUNDS, lambda: (1.0, 0.0, 0.0, 0.0), now).verb == Verb.ARM
+        return
+    with pytest.raises(RequestError, match=r"too late: the caller waited until 0\.5 s ago"):
+        request_of(message, BOUNDS, lambda: (1.0, 0.0, 0.0, 0.0), now)
