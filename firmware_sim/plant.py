@@ -155,10 +155,20 @@ class Plant:
             if not any(wanted) or any(pb.getDynamicsInfo(self.body, i, physicsClientId=self.client)[2]):
                 continue
             if any(float(tensor.get(k, "0")) for k in ("ixy", "ixz", "iyz")):
+                if not self._moves(i):
+                    continue
                 raise SettingsError(
                     f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor"
                 )
             pb.changeDynamics(self.body, i, localInertiaDiagonal=wanted, physicsClientId=self.client)
+
+    def _moves(self, link: int) -> bool:
+        """Return whether some joint of the arm moves a link."""
+        while link >= 0:
+            if link in self.index:
+                return True
+            link = self.parent[link]
+        return False
 
     def _joints(self) -> int:
         return int(pb.getNumJoints(self.body, physicsClientId=self.client))
