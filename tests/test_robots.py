@@ -225,6 +225,33 @@ def test_the_plant_accelerates_as_pinocchio_does_with_motors_and_friction(name: 
         plant.close()
 
 
+@pytest.mark.parametrize("name", ["puma560", "openarm_e2e"])
+@pytest.mark.parametrize("held", [(1,), (0, 2)])
+def test_joints_that_their_brakes_hold_leave_the_others_an_inertia_without_theirs(name: str, held: tuple[int, ...]):
+    """(A + J)_ff qdd_f = (tau - B qd - h - g)_f of the free joints f: what is held neither moves nor turns its motor."""
+    body, settings, n = arm(name).body, load_settings(config_of(name)), arm(name).n
+    free = [j for j in range(n) if j not in held]
+    friction = np.array([j.friction for j in settings.joints])
+    plant, rng = Plant(settings, settings.home, []), np.random.default_rng(3)
+    drag = [1e4 if j in held else 0.0 for j in range(n)]
+    try:
+        for q in 0.6 * postures(name, 3) + 0.4 * arm(name).home:
+            qd, tau = rng.uniform(-0.5, 0.5, n), rng.uniform(-0.2, 0.2, n) * arm(name).tau_max
+            qd[list(held)], tau[list(held)] = 0.0, 0.0
+            plant.place(q)
+            put_speed(plant, q, qd)
+            plant.step(tau.tolist(), drag)
+            got = (np.array(plant.qd) - qd) / (plant.step_ns * 1e-9)
+            A = pin.crba(body.model, body.data, q)
+            A = np.triu(A) + np.triu(A, 1).T
+            bias = pin.nonLinearEffects(body.model, body.data, q, qd)
+            wanted = np.linalg.solve(A[np.ix_(free, free)], (tau - friction * qd - bias)[free])
+            np.testing.assert_allclose(got[free], wanted, rtol=5e-3, atol=5e-2)
+            assert np.abs(np.array(plant.qd)[list(held)]).max() < 1e-3
+    finally:
+        plant.close()
+
+
 def test_the_tick_expects_the_acceleration_that_friction_leaves_of_the_torque_it_sent():
     r = arm("puma560")
     qd = np.array([0.6, -0.5, 0.7, 1.5, -1.2, 1.0])
