@@ -51,6 +51,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
             np.zeros(7),
             False,
             np.zeros(7),
+            law.nothing_ahead(arm),
         ),
     )
 

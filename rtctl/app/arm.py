@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from rtctl import design as cfg
+from rtctl.app.adviser import Adviser, Inline
 from rtctl.app.arm_link import ArmLink, link_spec, open_link
 from rtctl.app.arm_log import decoded, header_of, rebuild
 from rtctl.app.arm_scene import ArmPlay, scenario_robot
@@ -184,6 +185,7 @@ ARM = Vehicle(
     events=events,
     names=faults.names,
     status=status,
+    adviser=lambda robot, lockstep: Inline(robot) if lockstep else Adviser(robot),
     misplaced=misplaced,
     fallback=fallback,
     farewell=farewell,

@@ -1,0 +1,340 @@
+"""Beside the servo: finds what a goal needs that the law does not see, and says so as advice.
+
+Of a new goal it looks where the tip's own way would end. Where that is short of the goal, or in a limit or a shadow, it
+finds a posture that has the goal (`postures`): the null space heads for it, or the joints do, when the tip's way does
+not lead there. Where the arm is held all the same it plans a way (`plan`) and leads the joints along it; it yields to
+what moves, plans anew on a blocked way, and tries again when something moved. Counts bound its work, so that in a
+simulation equal inputs give equal advice.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from rtctl.app.postures import Ending, Site, along, endings, free_of_all, links_clear, packed, previewed, straight_room
+from rtctl.arm.kinematics import chain_of, clearance_of, clearances
+from rtctl.arm.memory import Memory
+from rtctl.arm.robot import Robot
+from rtctl.errors import PlanError
+from rtctl.types import B1, F64, Advice, Goal, State, Status
+from rtctl.world.primitives import Obstacles
+
+PERIOD = 0.01  # [s] between two pieces of advice
+LOOK = 0.05  # [s] between two looks at what comes
+HELD = frozenset(
+    (
+        Status.LOCAL_MINIMUM,
+        Status.ESCAPING,
+        Status.LIMITED,
+        Status.SHADOWED,
+        Status.SINGULAR,
+        Status.UNREACHABLE,
+        Status.SATURATED,
+    )
+)
+FINE = 0.03  # [rad] between two postures of a way
+AHEAD = 0.22  # [s] of full speed that the posture to head for is ahead
+SURE = 0.6  # of the way's own clearance that the straight line to it keeps
+NEAR = 0.06  # [rad] from the end of a way, where the goal itself is headed for
+HORIZON = 1.2  # [s] of what moves that is looked at
+STUCK = 0.8  # [s] without progress along a way
+PATIENCE = 1.0  # [s] for which it waits for what moves, then another way is planned
+AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
+PLANS = 8  # for one goal in a world that stands still
+
+
+class Seen(NamedTuple):
+    """What the guide is shown of the memory."""
+
+    tick: int
+    state: State
+    status: Status
+    goal: Goal | None
+    q: F64  # (n,) [rad]
+    obstacles: Obstacles  # the slots that are in use; without meshes, which belong to the robot
+
+
+def seen_of(m: Memory) -> Seen:
+    """Return what of a memory the guide is shown."""
+    mesh = np.zeros(0)
+    return Seen(m.tick, m.state, m.status, m.goal, m.joints.q.copy(), packed(m.world.obstacles)._replace(mesh=mesh))
+
+
+class Way(NamedTuple):
+    """A way of postures that is led along."""
+
+    Q: F64  # (k, n) [rad] FINE apart
+    rho: F64  # (k,) [m] of the points in each
+    clear: B1  # (k,) the links keep the clearance
+
+
+class Guide:
+    """What is known beside the servo of one robot's goal."""
+
+    way: Way | None
+    given: Ending | None  # the posture that was advised
+    ends: list[Ending]
+    at: int  # which posture of the way it has come to
+    moved_at: int  # tick of the last progress along it
+    waits_since: int  # tick; -1: it does not wait
+    look: int  # tick of the next look at what comes
+    again: int  # tick of the next attempt
+    tries: int
+    blocked: bool  # something comes across the way
+    told: str  # why there was no way
+    scene: bytes  # what rests
+
+    def __init__(self, robot: Robot, plans: bool, seed: int = 0, at_once: bool = False) -> None:
+        """plans: a planner may lead the arm; at_once: it does so of each goal, before anything held the arm."""
+        self.robot, self.plans, self.seed, self.at_once = robot, plans, seed, at_once
+        self.chain = chain_of(robot.body)
+        self.events: list[tuple[str, str]] = []  # name, detail
+        self.fresh = self.taught = False
+        self._forget()
+
+    def begin(self) -> None:
+        """Take note of a new goal: the memory's."""
+        self._forget()
+        self.fresh = True
+
+    def due(self, tick: int) -> bool:
+        """Return whether it has anything to say after this tick; it need not be shown what the others left."""
+        return self.fresh or tick % max(1, round(PERIOD / self.robot.dt)) == 0
+
+    def advise(self, m: Seen) -> Advice | None:
+        """Return advice for the next tick, None for nothing new; m: what the last one left."""
+        if m.state != State.RUN or m.goal is None or m.status == Status.ARRIVED:
+            if m.goal is None:
+                self._forget()
+            self.way = None
+            return None
+        if self.fresh:
+            self.fresh, self.taught = False, m.goal.posture is not None  # by somebody who knows better
+            self.scene = self._scene(m)
+            return None if self.taught else self._first(m, m.goal)
+        if not self.due(m.tick):
+            return None
+        changed = m.tick >= self.look and self._scene(m) != self.scene
+        if changed:
+            self.scene, self.tries = self._scene(m), 0
+            self.look = m.tick + round(LOOK / self.robot.dt)
+        if self.way is not None:
+            return self._along(m, m.goal, self.way, changed)
+        if changed and not self.taught:
+            return self._reviewed(m, m.goal)
+        if m.status in HELD and m.tick >= self.again:
+            return self._held(m, m.goal)
+        return None
+
+    def _scene(self, m: Seen) -> bytes:
+        """Return what tells whether what rests is as it was."""
+        o = m.obstacles
+        rests = ~(o.v.any(axis=1) | o.w.any(axis=1))
+        return b"".join(each[rests].tobytes() for each in (o.kind, o.p, o.R, o.dims))
+
+    def _site(self, m: Seen) -> Site:
+        return Site(self.robot, self.chain, m.obstacles._replace(mesh=self.robot.meshes.data), m.q)
+
+    # -- the first look ----------------------------------------------------------------------------------------------
+
+    def _first(self, m: Seen, goal: Goal) -> Advice | None:
+        self.given = None
+        site = self._site(m)
+        if self.at_once and self.plans:
+            return self._planned(m, goal, site)
+        Q, there = previewed(site, goal, self.robot.q_rest)
+        if there and free_of_all(site, Q[-1]):
+            return None
+        self.ends = endings(site, goal, self.seed)
+        for end in self.ends:
+            Q, there = previewed(site, goal, end.q)
+            if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
+                return self._given(end)
+        for end in self.ends:
+            if self._lead_straight(site, end):
+                return self._advice(m)
+        if not there and self.plans:
+            return self._planned(m, goal, site)
+        return self._given(self.ends[0]) if self.ends else None
+
+    def _given(self, end: Ending) -> Advice:
+        self.given = end
+        return Advice(end.q, clear=end.clear)
+
+    def _reviewed(self, m: Seen, goal: Goal) -> Advice | None:
+        """Return what is to be said of the goal when what rests is not as it was."""
+        if self.given is not None:
+            site, was = self._site(m), self.given
+            rho = self._room(site, was.q)
+            clear = bool(links_clear(site, was.q[None], np.array([rho]))[0])
+            self.given = was._replace(rho=rho, clear=clear)
+            if clear or not was.clear:
+                return self._given(self.given)
+        if m.tick < self.again:
+            return None
+        self.again = m.tick + round(AGAIN / self.robot.dt)
+        return self._first(m, goal)
+
+    def _clear(self, site: Site, Q: F64) -> bool:
+        rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
+        return bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
+
+    def _lead_straight(self, site: Site, end: Ending) -> bool:
+        """Take the straight way to a posture where it is free."""
+        least = 0.9 * min(self.robot.avoid.rho_min, end.rho, self._room(site, site.start))
+        if straight_room(site, site.start, end.q) <= max(least, 1e-3):
+            return False
+        self._take(site, np.array([site.start, end.q]))
+        return True
+
+    def _room(self, site: Site, q: F64) -> float:
+        return float(clearance_of(site.chain, self.robot.points, q[None], site.obstacles)[0])
+
+    # -- what holds the arm ------------------------------------------------------------------------------------------
+
+    def _held(self, m: Seen, goal: Goal) -> Advice | None:
+        site = self._site(m)
+        self.again = m.tick + round(AGAIN / self.robot.dt)
+        if self.plans:
+            return self._planned(m, goal, site)
+        if m.status == Status.ESCAPING or self.tries >= PLANS:
+            return None
+        self.tries += 1
+        self.ends = endings(site, goal, self.seed + self.tries)
+        for end in self.ends:
+            if np.abs(end.q - site.start).max() > 3.0 * NEAR and self._lead_straight(site, end):
+                return self._advice(m)
+        return None
+
+    def _planned(self, m: Seen, goal: Goal, site: Site) -> Advice | None:
+        try:
+            from rtctl.app.plan import plan_joints  # heavy, few goals need it, and not everybody has installed it
+        except ImportError as error:
+            self.plans = False
+            self.events.append(("no_plan", f"the planner is not installed: {error}"))
+            return None
+        moves = self._moves(site)
+        if self.tries >= PLANS and not moves:
+            return None
+        self.tries += 1
+        try:
+            path = plan_joints(site, goal, self.seed + self.tries, within=np.inf)
+        except PlanError as error:
+            if self.told != str(error):
+                self.events.append(("no_plan", str(error)))
+            self.told = str(error)
+            self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
+            return None
+        self._take(site, path)
+        self.events.append(("planned", f"a way of {len(path)} postures around what holds the arm"))
+        return self._advice(m)
+
+    def _take(self, site: Site, path: F64) -> None:
+        Q = np.concatenate([path[:1], *(along(a, b, FINE) for a, b in pairwise(path))])
+        rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
+        self.way = Way(Q, rho, links_clear(site, Q, rho))
+        self.at, self.moved_at, self.waits_since, self.blocked = 0, -1, -1, False
+
+    # -- along a way -------------------------------------------------------------------------------------------------
+
+    def _along(self, m: Seen, goal: Goal, way: Way, changed: bool = False) -> Advice | None:
+        robot, tick = self.robot, m.tick
+        at = self._progress(m.q, way)
+        if at > self.at or self.moved_at < 0:
+            self.at, self.moved_at = at, tick
+        end = way.Q[-1]
+        if np.abs(m.q - end).max() < NEAR:
+            self.way = None
+            self.again = tick + round(AGAIN / robot.dt)
+            return self._given(Ending(end, float(way.rho[-1]), bool(way.clear[-1]), 0.0))
+        site = self._site(m)
+        if changed or ((self.blocked or self._moves(site)) and tick >= self.look):
+            self.look = tick + round(LOOK / robot.dt)
+            self.blocked = self._comes(site, way)
+        if self.blocked:
+            return self._yield(m, goal, site, way)
+        self.waits_since = -1
+        if (tick - self.moved_at) * robot.dt > STUCK:
+            self.way = None
+            if self.plans:
+                return self._planned(m, goal, site)
+            return self._given(Ending(end, float(way.rho[-1]), bool(way.clear[-1]), 0.0))
+        return self._advice(m, site)
+
+    def _progress(self, q: F64, way: Way) -> int:
+        """Return which posture of the way the arm has come to: the nearest of those ahead."""
+        first = self.at
+        near = np.abs(way.Q[first : first + 40] - q).max(axis=1)
+        return first + int(near.argmin())
+
+    def _advice(self, m: Seen, site: Site | None = None) -> Advice:
+        """Return the posture of the way to head for now."""
+        way = self.way
+        assert way is not None
+        q, robot = m.q, self.robot
+        last = len(way.Q) - 1
+        full = robot.motion.speed_margin * robot.qd_max
+        away = (np.abs(way.Q[self.at :] - q) / full).max(axis=1)
+        reach = np.flatnonzero(away <= AHEAD)
+        ahead = self.at + int(reach[-1]) if len(reach) else min(self.at + 1, last)
+        if site is None:
+            return Advice(way.Q[ahead], True, bool(way.clear[ahead]))
+        while ahead > self.at + 1:
+            line = along(q, way.Q[ahead], 2.0 * FINE)
+            rho = float(clearance_of(site.chain, robot.points, line, site.obstacles).min())
+            if rho >= SURE * float(way.rho[self.at : ahead + 1].min()):
+                break
+            ahead = self.at + (ahead - self.at) // 2
+        return Advice(way.Q[ahead], True, bool(way.clear[ahead]))
+
+    # -- what moves --------------------------------------------------------------------------------------------------
+
+    def _moves(self, site: Site) -> bool:
+        return bool(site.obstacles.v.any() or site.obstacles.w.any())
+
+    def _comes(self, site: Site, way: Way) -> bool:
+        """Return whether something that moves will be on the way ahead, when the arm is."""
+        robot = self.robot
+        Q = way.Q[self.at :]
+        full = robot.motion.speed_margin * robot.qd_max
+        steps = (np.abs(np.diff(Q, axis=0)) / full).max(axis=1)
+        times = np.concatenate([[0.0], np.cumsum(steps)]) * 1.3
+        some = np.arange(0, int(np.searchsorted(times, HORIZON)), 3)
+        if not len(some):
+            return False
+        rho = self._rho(site, Q[some], times[some])
+        return bool((rho < np.minimum(self._floor(), 0.9 * rho[0])).any() and rho.min() < self._floor())
+
+    def _floor(self) -> float:
+        return 1.5 * self.robot.avoid.rho_min
+
+    def _rho(self, site: Site, Q: F64, times: F64) -> F64:
+        p = self.robot.points
+        return clearances(site.chain, p.link, p.local, p.radius, Q, site.obstacles, times, self.robot.avoid.rho0)
+
+    def _yield(self, m: Seen, goal: Goal, site: Site, way: Way) -> Advice | None:
+        """Wait where it is, or back off along the way where that is freer; else let the field have the arm."""
+        robot, tick = self.robot, m.tick
+        self.moved_at = tick
+        if self.waits_since < 0:
+            self.waits_since = tick
+            self.events.append(("yields", "to what moves across the way"))
+        if (tick - self.waits_since) * robot.dt > PATIENCE:
+            self.waits_since = tick
+            self.way = None
+            return self._planned(m, goal, site) if self.plans else None
+        times = np.array([0.0, 0.3, 0.6, 1.0])
+        best, most = -1, float(self._rho(site, np.tile(site.start, (4, 1)), times).min())
+        if most < robot.avoid.rho0:
+            for back in range(self.at, max(-1, self.at - 40), -8):
+                rho = float(self._rho(site, np.tile(way.Q[back], (4, 1)), times).min())
+                if rho > most + 0.01:
+                    best, most = back, rho
+        # towards itself: nothing but damping, so that the field is free to push
+        return Advice(site.start.copy() if best < 0 else way.Q[best], leads=True)
+
+    def _forget(self) -> None:
+        self.way, self.given, self.ends = None, None, []
+        self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
+        self.blocked, self.told, self.scene = False, "", b""
