@@ -118,24 +118,6 @@ def played(log: Path | None = None, **tables: object) -> Json:
     return simulate_scenario(scenario, PANDA, ROOT / "configs" / "none.toml", log)
 
 
-TABLE = {"name": "table", "type": "plane", "position_m": (0.0, 0.0, -0.02), "normal": (0.0, 0.0, 1.0)}
-BALL = {"name": "o0", "type": "sphere", "radius_m": 0.05, "position_m": (0.5, 0.182, 0.42)}
-
-
-@pytest.mark.parametrize(
-    ("goal", "obstacles", "within"),
-    [
-        ({"position_m": (0.5, 0.0, 0.35), "wxyz": DOWN}, (BALL,), 2.3),
-        ({"position_m": (0.5, 0.1, 0.03), "hold": "orientation"}, (TABLE,), 2.8),
-    ],
-)
-def test_a_goal_with_the_clearance_is_reached_beside_what_rests(goal, obstacles, within):
-    found = played(duration_s=within, goal=({"at_s": 0.3, **goal},), obstacle=obstacles)
-    assert found["arrived"]
-    assert found["contacts"] == 0
-    assert found["min_clearance_m"]["all"] >= 0.02
-
-
 def test_a_tool_turns_the_way_that_its_joints_can_and_the_log_replays_to_the_bit(tmp_path):
     log = tmp_path / "turn.mcap"
     goal = {"at_s": 0.3, "position_m": (0.4, 0.0, 0.45), "rpy_rad": (3.14159265, 0.0, -2.9)}

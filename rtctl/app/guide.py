@@ -12,7 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.app.postures import Ending, Site, along, endings, free_of_all, links_clear, packed, previewed, straight_room
+from rtctl.app.postures import (
+    Ending,
+    Site,
+    along,
+    endings,
+    free_of_all,
+    links_clear,
+    packed,
+    previewed,
+    straight_room,
+    swept,
+)
 from rtctl.arm.kinematics import chain_of, clearance_of, clearances
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
@@ -39,7 +50,8 @@ SURE = 0.6  # of the way's own clearance that the straight line to it keeps
 NEAR = 0.06  # [rad] from the end of a way, where the goal itself is headed for
 HORIZON = 1.2  # [s] of what moves that is looked at
 STUCK = 0.8  # [s] without progress along a way
-PATIENCE = 1.0  # [s] for which it waits for what moves, then another way is planned
+SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
+PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
 AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
 PLANS = 8  # for one goal in a world that stands still
 
@@ -218,12 +230,17 @@ class Guide:
         if self.tries >= PLANS and not moves:
             return None
         self.tries += 1
-        try:
-            path = plan_joints(site, goal, self.seed + self.tries, within=np.inf)
-        except PlanError as error:
-            if self.told != str(error):
-                self.events.append(("no_plan", str(error)))
-            self.told = str(error)
+        why = ""
+        for times in SWEPT if moves else SWEPT[-1:]:
+            try:
+                path = plan_joints(swept(site, times), goal, self.seed + self.tries, within=np.inf)
+                break
+            except PlanError as error:
+                why = str(error)
+        else:
+            if self.told != why:
+                self.events.append(("no_plan", why))
+            self.told = why
             self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
             return None
         self._take(site, path)

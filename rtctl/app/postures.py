@@ -4,6 +4,7 @@ Inverse kinematics from many starts (damped least squares, compiled); of what it
 to go there and what it lacks in room. Counts bound the work, not time: equal inputs give equal postures.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -14,8 +15,9 @@ from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
 from rtctl.design.solids import solids_of, surface
-from rtctl.types import B1, F64, Goal
-from rtctl.world.primitives import Obstacles
+from rtctl.plain import Json
+from rtctl.types import B1, F64, I64, Goal
+from rtctl.world.primitives import Obstacles, advance
 
 SEEDS = 48  # random starts
 ENDS = 8  # postures returned at most
@@ -24,6 +26,7 @@ TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
+SLOTS = Obstacles._fields[:9]  # what there is of each obstacle; the rest are bodies that they share
 
 
 class Site(NamedTuple):
@@ -46,21 +49,26 @@ class Ending(NamedTuple):
 
 def packed(obstacles: Obstacles) -> Obstacles:
     """Return the slots that are in use alone."""
-    used = np.flatnonzero(obstacles.active)
-    o = obstacles
-    return Obstacles(
-        o.kind[used],
-        o.active[used],
-        o.R[used],
-        o.p[used],
-        o.v[used],
-        o.w[used],
-        o.dims[used],
-        o.group[used],
-        o.margin[used],
-        o.mesh,
-        o.clouds,
-    )
+    return _chosen(obstacles, np.flatnonzero(obstacles.active))
+
+
+def _chosen(obstacles: Obstacles, k: I64) -> Obstacles:
+    return obstacles._replace(**{name: getattr(obstacles, name)[k] for name in SLOTS})
+
+
+def swept(site: Site, times: Sequence[float]) -> Site:
+    """Return the site with what moves where it will be at each of the times [s] too, unless it will be at the start."""
+    o = site.obstacles
+    rests, moves = [_chosen(o, np.flatnonzero((o.v.any(axis=1) | o.w.any(axis=1)) == moving)) for moving in (0, 1)]
+    found, robot = [rests, moves], site.robot
+    for t in times:
+        there = advance(moves, t)
+        for k in range(len(there.active)):
+            one = _chosen(there, np.array([k]))
+            if clearance_of(site.chain, robot.points, site.start[None], one)[0] > 1.5 * robot.avoid.rho_min:
+                found.append(one)
+    joined: Json = {name: np.concatenate([getattr(each, name) for each in found]) for name in SLOTS}
+    return site._replace(obstacles=o._replace(**joined))
 
 
 def site_of(robot: Robot, obstacles: Obstacles, start: F64) -> Site:

@@ -15,7 +15,7 @@ from rtctl.arm.points import Points
 from rtctl.arm.task import selection, task_error
 from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64, Goal
-from rtctl.world.primitives import Obstacles, distances_into
+from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
 
 REACHED = 1e-4  # [m], and ten times that [rad], of a posture that has a goal
 STEPS = 80  # of the inverse kinematics
@@ -170,15 +170,13 @@ def clearances(
     """
     out, rho = np.empty(Q.shape[0]), np.empty((obstacles.active.shape[0], 4, radius.shape[0]))
     for b in range(Q.shape[0]):
-        p = obstacles.p.copy()
+        p, R = obstacles.p, obstacles.R
         if times[b] != 0.0:
-            for k in range(p.shape[0]):
-                for i in range(3):
-                    p[k, i] += times[b] * obstacles.v[k, i]
+            p, R = advanced_pose(obstacles.active, p, R, obstacles.v, obstacles.w, times[b])
         at = Obstacles(
             obstacles.kind,
             obstacles.active,
-            obstacles.R,
+            R,
             p,
             obstacles.v,
             obstacles.w,
