@@ -155,6 +155,8 @@ class Guide:
         site = self._site(m)
         if self.at_once and self.plans:
             return self._planned(m, goal, site)
+        if not self.robot.postures:
+            return None
         Q, there = previewed(site, goal, self.robot.q_rest)
         if there and free_of_all(site, Q[-1]):
             return None
@@ -210,7 +212,7 @@ class Guide:
         self.again = m.tick + round(AGAIN / self.robot.dt)
         if self.plans:
             return self._planned(m, goal, site)
-        if m.status == Status.ESCAPING or self.tries >= PLANS:
+        if m.status == Status.ESCAPING or self.tries >= PLANS or not self.robot.postures:
             return None
         self.tries += 1
         self.ends = endings(site, goal, self.seed + self.tries)

@@ -105,6 +105,7 @@ def build(config: Config, path: str | Path) -> Robot:
         meshes=assets.meshes,
         motion=_motion(config),
         avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
+        postures=config.avoid.posture == "auto",
         plans=config.avoid.plan == "auto",
         escape=config.avoid.escape,
         self_avoid=_field(

@@ -180,6 +180,10 @@ class Avoid(Table, frozen=True, kw_only=True):
     escape: Annotated[bool, Meta(description="circulate around an obstacle that holds the arm short of its goal")] = (
         True
     )
+    posture: Annotated[
+        Literal["auto", "never"],
+        Meta(description="auto: a goal is pursued in a posture of its own; never: in that of rest"),
+    ] = "auto"
     plan: Annotated[
         Literal["auto", "never"], Meta(description="auto: a planner leads the arm where the law alone does not get on")
     ] = "auto"
