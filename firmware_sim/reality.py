@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from firmware_sim.settings import Settings, SettingsError
 
+ENGINES = ("bullet", "mujoco")
 IDEAL = -1.0  # a brake that holds whatever comes
 
 
@@ -34,12 +35,14 @@ class Reality(NamedTuple):
     reply_loss: float  # share of replies that never arrive
     reply_late: float  # share of replies that arrive a period late
     talkers: tuple[int, ...]  # CAN ids on which somebody else sends a frame every period
+    engine: str  # that moves the arm, one of ENGINES
+    model: str  # an MJCF file that stands for the robot file's URDF, '' for none
 
 
 KEYS = (
     "payload_kg", "payload_com_m", "payload_link", "mass_error", "inertia_error", "urdf_dynamics", "coulomb_Nm",
     "static_Nm", "viscous_Nms_rad", "torque_gain", "brake", "encoder_zero_rad", "encoder_direction", "reply_loss",
-    "reply_late", "talker_ids",
+    "reply_late", "talker_ids", "engine", "model",
 )  # fmt: skip
 
 
@@ -49,6 +52,11 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
     if unknown:
         raise SettingsError(f"plant.{unknown[0]}: unknown, wanted one of {', '.join(KEYS)}")
     n = len(settings.joints)
+    engine, model = _text(table, "engine") or ENGINES[0], _text(table, "model")
+    if engine not in ENGINES:
+        raise SettingsError(f"plant.engine: got {engine!r}, wanted one of {', '.join(ENGINES)}")
+    if model and engine != "mujoco":
+        raise SettingsError(f'plant.model: an MJCF needs engine = "mujoco", which is "{engine}"')
     coulomb = _each(table, "coulomb_Nm", n, [j.coulomb for j in settings.joints], _within(0.0, 1000.0))
     return Reality(
         payload_kg=_one(table, "payload_kg", 0.0, _within(0.0, 200.0)),
@@ -67,6 +75,8 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
         reply_loss=_one(table, "reply_loss", 0.0, _within(0.0, 1.0)),
         reply_late=_one(table, "reply_late", 0.0, _within(0.0, 1.0)),
         talkers=_ids(table, "talker_ids"),
+        engine=engine,
+        model=model,
     )
 
 

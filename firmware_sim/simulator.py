@@ -65,7 +65,7 @@ class Simulator:
         real = self.reality
         traffic = Traffic(real.reply_loss, real.reply_late, real.talkers, settings.fd, injector.seed)
         self.wire = Wire(self.bank, injector, settings.fd, traffic)
-        self.plant = Plant(settings, start_q, obstacles, self.reality)
+        self.plant = plant_of(settings, start_q, obstacles, self.reality)
         self.started = not wait
         self.exact = True  # whether every truth tells exact clearances; else their least over the run alone are exact
         self._size = frozenset((self.bank.size,))
@@ -167,6 +167,19 @@ class Simulator:
     def close(self) -> None:
         """Free the plant."""
         self.plant.close()
+
+
+def plant_of(
+    settings: Settings, start_q: Sequence[float], obstacles: Sequence[dict[str, Any]], reality: Reality
+) -> Plant:
+    """Return the arm and its world in the engine that `[plant]` asks for. Raises SettingsError, also without it."""
+    if reality.engine != "mujoco":
+        return Plant(settings, start_q, obstacles, reality)
+    try:
+        from firmware_sim.second import SecondPlant
+    except ModuleNotFoundError as error:
+        raise SettingsError(f'plant.engine: {error}; pip install "rtctl[sim]"') from error
+    return SecondPlant(settings, start_q, obstacles, reality)
 
 
 def open_simulator(

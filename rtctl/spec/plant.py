@@ -62,3 +62,14 @@ class PlantTable(Table, frozen=True, kw_only=True):
     talker_ids: Annotated[
         tuple[CanId, ...], Meta(max_length=8, description="on each of them somebody else sends a frame every period")
     ] = ()
+    engine: Annotated[Literal["bullet", "mujoco"], Meta(description="what moves the arm")] = "bullet"
+    model: (
+        Annotated[
+            str,
+            Meta(
+                max_length=4096,
+                description="MJCF that moves in the place of the URDF: a path beside the robot file, or package://",
+            ),
+        ]
+        | None
+    ) = None
