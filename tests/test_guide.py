@@ -1,5 +1,7 @@
 """Beside the servo: postures by Pinocchio, goals near obstacles by pybullet, advice in the log, the guide's process."""
 
+import os
+import signal
 import time
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.arm.field import Ends, MovingPoints, field_buffers, field_to
 from rtctl.arm.kinematics import chain_of, placements, points_at, tip_at
+from rtctl.arm.memory import MEASURED_POSTURE, Memory
 from rtctl.arm.pipe import initial
 from rtctl.kernel.rotations import quat_of
 from rtctl.log import schema
@@ -23,9 +26,9 @@ from rtctl.log.record.requests import decode_request, encode_request
 from rtctl.plain import Json
 from rtctl.spec.read import convert
 from rtctl.spec.scenario import Scenario
-from rtctl.types import Advice, Goal, Request, Shape, State, Status, Task
+from rtctl.types import Advice, Goal, ObstacleEdit, Request, Shape, State, Status, Task
 from rtctl.world.primitives import Obstacles, distances, obstacles_empty, with_shape
-from tests.lab import PANDA, ROOT, robot
+from tests.lab import PANDA, ROOT, lab, robot
 
 HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 DOWN = (0.0, 1.0, 0.0, 0.0)
@@ -170,21 +173,57 @@ def test_a_way_is_left_to_what_will_cross_it_and_taken_again():
     assert np.abs(gone.posture - HOME).max() > 0.05
 
 
-def test_the_process_advises_and_ends():
+def held(m: Memory, tick: int) -> Memory:
+    """Return a memory of an arm that is held in a limit, the tool still to be turned."""
+    goal = Goal(np.array([0.4, 0.0, 0.45]), np.array([0.0, 0.9926, 0.1208, 0.0]), Task.POSE, 0.003, 0.015)
+    return m._replace(tick=tick, state=State.RUN, status=Status.LIMITED, goal=goal)
+
+
+def test_the_process_advises_is_never_waited_for_and_ends():
     arm = robot()
     adviser = Adviser(arm)
     try:
+        assert adviser.pid != os.getpid()
         m = initial(arm, first_feedback(np.array(HOME)))
-        goal = Goal(np.array([0.4, 0.0, 0.45]), np.array([0.0, 0.9926, 0.1208, 0.0]), Task.POSE, 0.003, 0.015)
         adviser.begin()
         for tick in range(0, 100_000, 10):
-            advice = adviser.advise(m._replace(tick=tick, state=State.RUN, status=Status.LIMITED, goal=goal))
+            advice = adviser.advise(held(m, tick))
             if advice is not None:
                 break
             time.sleep(0.01)
         assert advice is not None
         assert advice.posture.shape == (7,)
+
+        os.kill(adviser.pid, signal.SIGSTOP)  # it hangs: what is shown piles up, and nobody waits
+        for tick in range(0, 20_000, 10):
+            adviser.advise(held(m, tick))
+        adviser.begin()
+        assert adviser.advise(held(m, 0)) is None  # what was said of the other goal is dropped
+
+        os.kill(adviser.pid, signal.SIGKILL)
+        os.waitpid(adviser.pid, 0)
+        while not adviser.events:
+            assert adviser.advise(held(m, 0)) is None
+        assert adviser.events[-1][0] == "no_guide"
     finally:
         adviser.close()
     with pytest.raises(ProcessLookupError):
-        __import__("os").kill(adviser.pid, 0)
+        os.kill(adviser.pid, 0)
+
+
+def test_a_posture_measured_among_other_obstacles_is_not_trusted_beside_a_new_one():
+    arm = robot()
+    with lab() as here:
+        here.running()
+        here.ask([0.45, 0.1, 0.45])
+        here.step(Request(advice=Advice(np.array(HOME), clear=True)))
+        assert here.memory.has_posture == MEASURED_POSTURE
+        comes = ball(np.array([0.6, 0.6, 0.6]))._replace(velocity=np.array([0.1, 0.0, 0.0]))
+        here.step(Request(obstacles=(ObstacleEdit("ball", comes),)))
+        assert here.memory.has_posture == MEASURED_POSTURE
+        here.step(Request(obstacles=(ObstacleEdit("ball", ball(np.array([0.6, 0.6, 0.6]))),)))
+        assert here.memory.has_posture == 1
+        here.step(Request(advice=Advice(np.full(arm.n, 9.0))))  # beyond the limits: nobody asked for it, nobody is told
+        assert not here.memory.refusal
+        assert here.memory.goal is not None
+        np.testing.assert_array_equal(here.memory.goal.posture, HOME)

@@ -7,7 +7,6 @@ what moves, plans anew on a blocked way, and tries again when something moved. C
 simulation equal inputs give equal advice.
 """
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,21 +14,24 @@ import numpy as np
 from rtctl.app.postures import (
     Ending,
     Site,
-    along,
     endings,
     free_of_all,
     links_clear,
     packed,
     previewed,
+    site_of,
     straight_room,
     swept,
 )
-from rtctl.arm.kinematics import chain_of, clearance_of, clearances
+from rtctl.app.way import Way, comes, heading, moves, progress, way_of, yielding
+from rtctl.arm.freedom import Room, body_of, first_blocked
+from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.errors import PlanError
-from rtctl.types import B1, F64, Advice, Goal, State, Status
-from rtctl.world.primitives import Obstacles
+from rtctl.kernel.rotations import quat_of
+from rtctl.types import F64, Advice, Goal, Shape, State, Status
+from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 
 PERIOD = 0.01  # [s] between two pieces of advice
 LOOK = 0.05  # [s] between two looks at what comes
@@ -44,11 +46,7 @@ HELD = frozenset(
         Status.SATURATED,
     )
 )
-FINE = 0.03  # [rad] between two postures of a way
-AHEAD = 0.22  # [s] of full speed that the posture to head for is ahead
-SURE = 0.6  # of the way's own clearance that the straight line to it keeps
 NEAR = 0.06  # [rad] from the end of a way, where the goal itself is headed for
-HORIZON = 1.2  # [s] of what moves that is looked at
 STUCK = 0.8  # [s] without progress along a way
 SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
 PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
@@ -73,12 +71,19 @@ def seen_of(m: Memory) -> Seen:
     return Seen(m.tick, m.state, m.status, m.goal, m.joints.q.copy(), packed(m.world.obstacles)._replace(mesh=mesh))
 
 
-class Way(NamedTuple):
-    """A way of postures that is led along."""
-
-    Q: F64  # (k, n) [rad] FINE apart
-    rho: F64  # (k,) [m] of the points in each
-    clear: B1  # (k,) the links keep the clearance
+def warm(robot: Robot) -> None:
+    """Run what it looks with once, so that nothing is compiled while an arm waits for advice."""
+    far = Shape(
+        "far", "sphere", np.full(4, 0.1), np.array([0.0, 0.0, 50.0]), quat_of(np.eye(3)), np.ones(3), np.ones(3)
+    )
+    site = site_of(robot, with_shape(obstacles_empty(1), 0, far), robot.home)
+    tip = robot.body.evaluate(robot.home, np.zeros(robot.n), robot.points)
+    goal = Goal(tip.x, quat_of(tip.R), robot.axes, robot.tolerance, robot.tolerance_rot)
+    endings(site, goal, 0, seeds=1)
+    previewed(site, goal, robot.q_rest)
+    links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
+    body, anchors = body_of(robot), robot.home[None]
+    first_blocked(body, anchors, site.obstacles, Room(0.0, 0.0, anchors, np.zeros((1, 2))), 1.0)
 
 
 class Guide:
@@ -165,9 +170,9 @@ class Guide:
             Q, there = previewed(site, goal, end.q)
             if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
                 return self._given(end)
-        for end in self.ends:
-            if self._lead_straight(site, end):
-                return self._advice(m)
+        led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)
+        if led is not None:
+            return led
         if not there and self.plans:
             return self._planned(m, goal, site)
         return self._given(self.ends[0]) if self.ends else None
@@ -194,13 +199,12 @@ class Guide:
         rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
         return bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
 
-    def _lead_straight(self, site: Site, end: Ending) -> bool:
+    def _straight(self, site: Site, end: Ending) -> Advice | None:
         """Take the straight way to a posture where it is free."""
         least = 0.9 * min(self.robot.avoid.rho_min, end.rho, self._room(site, site.start))
         if straight_room(site, site.start, end.q) <= max(least, 1e-3):
-            return False
-        self._take(site, np.array([site.start, end.q]))
-        return True
+            return None
+        return heading(site, self._take(site, np.array([site.start, end.q])), 0, False)
 
     def _room(self, site: Site, q: F64) -> float:
         return float(clearance_of(site.chain, self.robot.points, q[None], site.obstacles)[0])
@@ -216,10 +220,8 @@ class Guide:
             return None
         self.tries += 1
         self.ends = endings(site, goal, self.seed + self.tries)
-        for end in self.ends:
-            if np.abs(end.q - site.start).max() > 3.0 * NEAR and self._lead_straight(site, end):
-                return self._advice(m)
-        return None
+        far = [end for end in self.ends if np.abs(end.q - site.start).max() > 3.0 * NEAR]
+        return next((advice for end in far if (advice := self._straight(site, end)) is not None), None)
 
     def _planned(self, m: Seen, goal: Goal, site: Site) -> Advice | None:
         try:
@@ -228,12 +230,11 @@ class Guide:
             self.plans = False
             self.events.append(("no_plan", f"the planner is not installed: {error}"))
             return None
-        moves = self._moves(site)
-        if self.tries >= PLANS and not moves:
+        if self.tries >= PLANS and not moves(site):
             return None
         self.tries += 1
         why = ""
-        for times in SWEPT if moves else SWEPT[-1:]:
+        for times in SWEPT if moves(site) else SWEPT[-1:]:
             try:
                 path = plan_joints(swept(site, times), goal, self.seed + self.tries, within=np.inf)
                 break
@@ -245,113 +246,44 @@ class Guide:
             self.told = why
             self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
             return None
-        self._take(site, path)
         self.events.append(("planned", f"a way of {len(path)} postures around what holds the arm"))
-        return self._advice(m)
+        return heading(site, self._take(site, path), 0, False)
 
-    def _take(self, site: Site, path: F64) -> None:
-        Q = np.concatenate([path[:1], *(along(a, b, FINE) for a, b in pairwise(path))])
-        rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
-        self.way = Way(Q, rho, links_clear(site, Q, rho))
+    def _take(self, site: Site, path: F64) -> Way:
+        self.way = way_of(site, path)
         self.at, self.moved_at, self.waits_since, self.blocked = 0, -1, -1, False
+        return self.way
 
     # -- along a way -------------------------------------------------------------------------------------------------
 
-    def _along(self, m: Seen, goal: Goal, way: Way, changed: bool = False) -> Advice | None:
-        robot, tick = self.robot, m.tick
-        at = self._progress(m.q, way)
+    def _along(self, m: Seen, goal: Goal, way: Way, changed: bool) -> Advice | None:
+        site, dt, at = self._site(m), self.robot.dt, progress(way, self.at, m.q)
         if at > self.at or self.moved_at < 0:
-            self.at, self.moved_at = at, tick
-        end = way.Q[-1]
-        if np.abs(m.q - end).max() < NEAR:
-            self.way = None
-            self.again = tick + round(AGAIN / robot.dt)
-            return self._given(Ending(end, float(way.rho[-1]), bool(way.clear[-1]), 0.0))
-        site = self._site(m)
-        if changed or ((self.blocked or self._moves(site)) and tick >= self.look):
-            self.look = tick + round(LOOK / robot.dt)
-            self.blocked = self._comes(site, way)
+            self.at, self.moved_at = at, m.tick
+        if np.abs(m.q - way.Q[-1]).max() < NEAR:
+            self.way, self.again = None, m.tick + round(AGAIN / dt)
+            return self._given(way.end)
+        if changed or ((self.blocked or moves(site)) and m.tick >= self.look):
+            self.look = m.tick + round(LOOK / dt)
+            self.blocked = comes(site, way, self.at)
         if self.blocked:
             return self._yield(m, goal, site, way)
         self.waits_since = -1
-        if (tick - self.moved_at) * robot.dt > STUCK:
+        if (m.tick - self.moved_at) * dt > STUCK:
             self.way = None
-            if self.plans:
-                return self._planned(m, goal, site)
-            return self._given(Ending(end, float(way.rho[-1]), bool(way.clear[-1]), 0.0))
-        return self._advice(m, site)
-
-    def _progress(self, q: F64, way: Way) -> int:
-        """Return which posture of the way the arm has come to: the nearest of those ahead."""
-        first = self.at
-        near = np.abs(way.Q[first : first + 40] - q).max(axis=1)
-        return first + int(near.argmin())
-
-    def _advice(self, m: Seen, site: Site | None = None) -> Advice:
-        """Return the posture of the way to head for now."""
-        way = self.way
-        assert way is not None
-        q, robot = m.q, self.robot
-        last = len(way.Q) - 1
-        full = robot.motion.speed_margin * robot.qd_max
-        away = (np.abs(way.Q[self.at :] - q) / full).max(axis=1)
-        reach = np.flatnonzero(away <= AHEAD)
-        ahead = self.at + int(reach[-1]) if len(reach) else min(self.at + 1, last)
-        if site is None:
-            return Advice(way.Q[ahead], True, bool(way.clear[ahead]))
-        while ahead > self.at + 1:
-            line = along(q, way.Q[ahead], 2.0 * FINE)
-            rho = float(clearance_of(site.chain, robot.points, line, site.obstacles).min())
-            if rho >= SURE * float(way.rho[self.at : ahead + 1].min()):
-                break
-            ahead = self.at + (ahead - self.at) // 2
-        return Advice(way.Q[ahead], True, bool(way.clear[ahead]))
-
-    # -- what moves --------------------------------------------------------------------------------------------------
-
-    def _moves(self, site: Site) -> bool:
-        return bool(site.obstacles.v.any() or site.obstacles.w.any())
-
-    def _comes(self, site: Site, way: Way) -> bool:
-        """Return whether something that moves will be on the way ahead, when the arm is."""
-        robot = self.robot
-        Q = way.Q[self.at :]
-        full = robot.motion.speed_margin * robot.qd_max
-        steps = (np.abs(np.diff(Q, axis=0)) / full).max(axis=1)
-        times = np.concatenate([[0.0], np.cumsum(steps)]) * 1.3
-        some = np.arange(0, int(np.searchsorted(times, HORIZON)), 3)
-        if not len(some):
-            return False
-        rho = self._rho(site, Q[some], times[some])
-        return bool((rho < np.minimum(self._floor(), 0.9 * rho[0])).any() and rho.min() < self._floor())
-
-    def _floor(self) -> float:
-        return 1.5 * self.robot.avoid.rho_min
-
-    def _rho(self, site: Site, Q: F64, times: F64) -> F64:
-        p = self.robot.points
-        return clearances(site.chain, p.link, p.local, p.radius, Q, site.obstacles, times, self.robot.avoid.rho0)
+            return self._planned(m, goal, site) if self.plans else self._given(way.end)
+        return heading(site, way, self.at, True)
 
     def _yield(self, m: Seen, goal: Goal, site: Site, way: Way) -> Advice | None:
-        """Wait where it is, or back off along the way where that is freer; else let the field have the arm."""
-        robot, tick = self.robot, m.tick
-        self.moved_at = tick
+        """Yield to what moves; after a while look for another way."""
+        self.moved_at = m.tick
         if self.waits_since < 0:
-            self.waits_since = tick
+            self.waits_since = m.tick
             self.events.append(("yields", "to what moves across the way"))
-        if (tick - self.waits_since) * robot.dt > PATIENCE:
-            self.waits_since = tick
-            self.way = None
+        if (m.tick - self.waits_since) * self.robot.dt > PATIENCE:
+            self.waits_since, self.way = m.tick, None
             return self._planned(m, goal, site) if self.plans else None
-        times = np.array([0.0, 0.3, 0.6, 1.0])
-        best, most = -1, float(self._rho(site, np.tile(site.start, (4, 1)), times).min())
-        if most < robot.avoid.rho0:
-            for back in range(self.at, max(-1, self.at - 40), -8):
-                rho = float(self._rho(site, np.tile(way.Q[back], (4, 1)), times).min())
-                if rho > most + 0.01:
-                    best, most = back, rho
-        # towards itself: nothing but damping, so that the field is free to push
-        return Advice(site.start.copy() if best < 0 else way.Q[best], leads=True)
+        return yielding(site, way, self.at)
 
     def _forget(self) -> None:
         self.way, self.given, self.ends = None, None, []
