@@ -54,6 +54,7 @@ from rtctl.types import (
 )
 from rtctl.world import obstacle_table, primitives
 
+SIGMA_MIN = 0  # its place in the parameters, see `flat.parameters_of`
 ZERO = np.zeros(3)
 DRIVES = tuple(Drive(i) for i in range(4))  # an enumeration looks its numbers up slowly
 
@@ -137,7 +138,10 @@ def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
     h, n = record_of(hot)[0], robot.n
     if h["evaluated"]:
         model = robot.body.evaluate(h["q"][:n], h["qd"][:n], robot.points, robot.own, h["payload"].tolist())
-    return model, parameters_of(model, int(h["task"]), h["axis"], robot.motion)
+    parameters = parameters_of(model, int(h["task"]), h["axis"], robot.motion)
+    if not h["task"]:  # the joints lead: no task is singular, and the log holds numbers
+        parameters[SIGMA_MIN] = 0.0
+    return model, parameters
 
 
 def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> Memory:
