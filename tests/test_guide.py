@@ -202,9 +202,10 @@ def test_the_process_advises_is_never_waited_for_and_ends():
 
         os.kill(adviser.pid, signal.SIGKILL)
         os.waitpid(adviser.pid, 0)
+        adviser.events.clear()
         while not adviser.events:
             assert adviser.advise(held(m, 0)) is None
-        assert adviser.events[-1][0] == "no_guide"
+        assert [name for name, _ in adviser.events] == ["no_guide"]
     finally:
         adviser.close()
     with pytest.raises(ProcessLookupError):
