@@ -42,7 +42,6 @@ NOTES = DOCS / "pictures.json"
 DEMO, WORLDS = ROOT / "configs" / "demo.toml", ROOT / "configs" / "worlds"
 AT, AT_ROVER = 29.4, 15.0  # [s] of what the page is shown: the visitor pushes the elbow; the rover rounds the U
 WIDE, PHONE = (1400, 900), (390, 844)
-COLOURS = 200  # of a file: half the bytes of one with all
 CLOSE = "document.querySelectorAll('.mantine-Notification-root button').forEach(each => each.click())"
 PRESS = "[...document.querySelectorAll('button')].find(each => each.innerText.trim() === 'Pause').click()"
 
@@ -168,16 +167,16 @@ def taken(chrome: browser.Browser, path: Path, size: tuple[int, int], record: Re
         chrome.drawn()
     chrome.picture(path)
     with Image.open(path) as image:
-        small = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        small = image.convert("RGB").reduce(2 if size[0] < size[1] else 1)
     small.save(path, optimize=True)
 
 
 def in_foxglove(folder: Path) -> dict[str, Made]:
     """Open the demo's log in Foxglove's own core."""
     log = played(DEMO, folder)[1]
-    if foxglove.main([str(log), "--at", "29.4", "--png", str(DOCS / "foxglove.png")]):
+    if foxglove.main([str(log), "--at", "26", "--png", str(DOCS / "foxglove.png")]):
         raise RtctlError("Foxglove found problems in the log")
-    return {"foxglove.png": Made("python -m tools.foxglove run.mcap --at 29.4 --png docs/foxglove.png", [])}
+    return {"foxglove.png": Made("python -m tools.foxglove run.mcap --at 26 --png docs/foxglove.png", [])}
 
 
 PARTS: dict[str, Callable[[Path], dict[str, Made]]] = {
@@ -203,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(part, flush=True)
             for picture, made in PARTS[part](Path(name)).items():
                 notes[picture] = {"sha256": digest(DOCS / picture), "by": made.by, "says": made.says}
-    NOTES.write_text(json.dumps(dict(sorted(notes.items())), indent=2) + "\n", encoding="utf-8")
+            NOTES.write_text(json.dumps(dict(sorted(notes.items())), indent=2) + "\n", encoding="utf-8")
     return 0
 
 

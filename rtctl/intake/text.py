@@ -12,7 +12,7 @@ from rtctl.types import F64
 RATES = (1000, 500, 250)  # [Hz]
 PAYLOAD = 12  # bytes of a protected frame
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
-LEG = 6.0  # [s] to reach a goal, beside an obstacle and for a large arm
+LEG = 4.0  # [s] to reach a goal
 
 
 class Settings(NamedTuple):
