@@ -204,7 +204,7 @@ def test_links_that_protrude_from_their_automatic_points_beyond_the_clearance_ar
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few = [("panda_link4", np.zeros(3), 0.05)]
-    monkeypatch.setattr(points, "place", lambda body: points.given(body, few))
+    monkeypatch.setattr(points, "place", lambda body, *_: points.given(body, few))
     with pytest.raises(ConfigError, match=r"avoid\.clearance_m: got 0\.02, wanted more than the .* protrude"):
         design.build(design.load(PANDA), PANDA)
 

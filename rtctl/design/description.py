@@ -31,9 +31,9 @@ def notes(urdf: Path, joints: Sequence[str]) -> tuple[Note, ...]:
         if tensor is None or possible(tensor):
             continue
         moments = ", ".join(f"{m:.3g}" for m in np.linalg.eigvalsh(tensor))
-        text = f"no body has the principal moments {moments} kg m2: the largest is more than the others together"
+        text = f"no body has the moments {moments} kg m2"
         if name not in moved:
-            found.append(Note(name, f"{text}; it does not move, so nothing comes of it"))
+            found.append(Note(name, f"{text}; it does not move"))
         else:
             diagonal = bool((tensor == np.diag(np.diag(tensor))).all())
             found.append(Note(name, text, not diagonal))

@@ -188,14 +188,14 @@ def _unbraked(c: Config, r: Robot, found: Extremes) -> list[Row]:
         if brake:
             continue
         g, kp, kd = found.gravity[i], r.stop.kp[i], r.stop.kd[i]
-        note = (
-            f"no brake: by its drive's kp {kp:.3g} Nm/rad within {g / kp:.2g} rad of {g:.3g} Nm; "
-            f"kd {kd:.2g} Nms/rad alone carries {SLOW * kd:.2g} Nm at {SLOW:g} rad/s, and sinks at {g / kd:.2g} rad/s"
+        rows.append(
+            _row(f"held at {joint}", g / kp, "rad", f"no brake; kp {kp:.3g} Nm/rad, {g:.3g} Nm", bool(g / kp < SAG))
         )
-        rows.append(_row(f"held at {joint}", g / kp, "rad", note, bool(g / kp < SAG)))
+        note = f"sinks by kd {kd:.2g} alone; that carries {SLOW * kd:.2g} Nm at {SLOW:g} rad/s"
+        rows.append(_row(f"damped at {joint}", g / kd, "rad/s", note))
     if rows:
         parked = c.robot.park_rad is not None
-        note = "robot.park_rad: disarm there" if parked else "no robot.park_rad: nowhere to disarm but with --drop"
+        note = "robot.park_rad: disarm there" if parked else "no robot.park_rad: disarm with --drop alone"
         rows.append(_row("place to park", int(parked), "", note, parked))
     return rows
 
@@ -205,7 +205,7 @@ def _resolution(r: Robot) -> list[Row]:
     inertia = r.stop.damping / r.stop.decay  # A_ii at home
     step = r.tau_lsb / np.sqrt(12.0) / inertia / r.joint_filter.sigma_qdd
     i = int(step.argmax())
-    note = f"worst: {r.joints[i]}: a step of {r.tau_lsb[i]:.2g} Nm, over estimator.joint_acceleration_rad_s2"
+    note = f"of the estimator's noise is a step of {r.tau_lsb[i]:.2g} Nm, worst: {r.joints[i]}"
     return [_row("torque resolution", step[i], "x", note, bool(step[i] <= 1.0))]
 
 
@@ -214,8 +214,8 @@ def _description(r: Robot) -> list[Row]:
     rows = [_row(f"inertia of {note.about}", 0, "", note.text, False) for note in notes(Path(r.urdf), r.joints)]
     if found := dynamics(Path(r.urdf), r.joints):
         damping, friction = (max(values[k] for values in found.values()) for k in (0, 1))
-        note = f"Nms/rad of damping and {friction:g} Nm of friction are not used of the URDF; friction_Nms_rad is"
-        rows.append(_row("URDF dynamics", damping, "", note))
+        note = f"damping, and {friction:g} Nm of friction: not used, the file's friction is"
+        rows.append(_row("URDF dynamics", damping, "Nms/rad", note))
     return rows
 
 
@@ -227,7 +227,7 @@ def _points(c: Config, r: Robot) -> list[Row]:
         _row("points cover", 100 * cover.fraction, "%", "of the links' surface samples", fine),
         _row("protrusion", cover.protrusion, "m", f"of a link beyond its points; clearance {r.avoid.rho_min:g}", fine),
         _row("overhang", cover.overhang, "m", "of the points beyond the links"),
-        _row("gap", _gap(r), "m", "wider than a link: what a planned way surely passes; overhang_m and clearance_m"),
+        _row("gap", _gap(r), "m", "wider than a link: a planned way surely passes (overhang_m)"),
         _row(
             "self-collision pairs",
             len(r.own.pairs),
