@@ -68,11 +68,15 @@ class Joints:
         out = [g * d * t for g, d, t in zip(r.torque_gain, r.encoder_direction, torque, strict=True)]
         return out, [self._brake(k, bound) for k, bound in enumerate(drag)]
 
-    def rub(self, A: F64, free: F64, qd: F64, dt: float) -> F64:
-        """Return the friction (n,) [Nm] of a step; arguments as of `friction`."""
+    def rub(self, A: F64, free: F64, qd: F64, dt: float, drag: F64) -> tuple[F64, F64]:
+        """Return the torques (n,) [Nm] of friction and of brakes in a step; arguments as of `friction`.
+
+        drag (n,) [Nm]: how much the brakes can give. Friction comes first, brakes give what is left of what rest needs.
+        """
         bound = np.where(np.abs(qd) < CREEP, self.static, self.coulomb)
-        self.last = friction(A, free, qd, bound, dt, self.last)
-        return self.last
+        self.last = friction(A, free, qd, bound + drag, dt, self.last)
+        rubbing = np.clip(self.last, -bound, bound)
+        return rubbing, self.last - rubbing
 
     def read(self, q: Sequence[float], qd: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
         """Return positions [rad] and speeds [rad/s] as the drives' encoders see the joints that are mounted so."""

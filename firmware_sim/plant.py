@@ -155,10 +155,20 @@ class Plant:
             if not any(wanted) or any(pb.getDynamicsInfo(self.body, i, physicsClientId=self.client)[2]):
                 continue
             if any(float(tensor.get(k, "0")) for k in ("ixy", "ixz", "iyz")):
+                if not self._moves(i):
+                    continue
                 raise SettingsError(
                     f"{self.settings.urdf}: link {link.get('name')}: no body has such an inertia tensor"
                 )
             pb.changeDynamics(self.body, i, localInertiaDiagonal=wanted, physicsClientId=self.client)
+
+    def _moves(self, link: int) -> bool:
+        """Return whether some joint of the arm moves a link."""
+        while link >= 0:
+            if link in self.index:
+                return True
+            link = self.parent[link]
+        return False
 
     def _joints(self) -> int:
         return int(pb.getNumJoints(self.body, physicsClientId=self.client))
@@ -223,7 +233,7 @@ class Plant:
         if self.pushed:
             torque = (np.asarray(torque) + self._pushed()).tolist()
         if self.motors:
-            torque = self._with_motors(torque)
+            torque = self._with_motors(torque, drag)
         pb.setJointMotorControlArray(
             self.body, self.index, pb.TORQUE_CONTROL, forces=torque, physicsClientId=self.client
         )
@@ -233,18 +243,23 @@ class Plant:
         self.time_ns += self.step_ns
         self._read()
 
-    def _with_motors(self, torque: Sequence[float]) -> list[float]:
+    def _with_motors(self, torque: Sequence[float], drag: Sequence[float]) -> list[float]:
         """Return the torques that move the arm as if each joint also carried its motor's inertia and friction.
 
-        (A + diag(J G^2)) qdd = tau - B G^2 qd - f - h - g; pybullet, which knows A alone, gets tau - B G^2 qd - f -
-        J G^2 qdd. The friction f is that of `friction`.
+        (A + diag(J G^2)) qdd = tau - B G^2 qd - f - b - h - g; pybullet, which knows A alone and finds the brakes' b by
+        itself, gets tau - B G^2 qd - f - J G^2 qdd. The friction f is that of `friction`, and b <= drag [Nm] another:
+        a joint that its brake holds does not carry its motor's inertia along.
         """
         A = np.array(pb.calculateMassMatrix(self.body, self.q, physicsClientId=self.client))
         bias = pb.calculateInverseDynamics(self.body, self.q, self.qd, [0.0] * len(self.q), physicsClientId=self.client)
         tau = np.asarray(torque, dtype=np.float64) - self.friction * np.array(self.qd)
-        if self.joints.rubs:
-            tau -= self.joints.rub(A + self._rotors, tau - np.array(bias), np.array(self.qd), self.step_ns / NS)
-        qdd = np.linalg.solve(A + self._rotors, tau - np.array(bias))
+        braked = np.zeros(len(tau))
+        if self.joints.rubs or any(drag):
+            rubbing, braked = self.joints.rub(
+                A + self._rotors, tau - np.array(bias), np.array(self.qd), self.step_ns / NS, np.array(drag)
+            )
+            tau -= rubbing
+        qdd = np.linalg.solve(A + self._rotors, tau - braked - np.array(bias))
         result: list[float] = (tau - self.armature * qdd).tolist()
         return result
 

@@ -1,7 +1,8 @@
 """What a real arm has and its model does not: payload, wrong masses, friction, weak motors, brakes that slip or lack.
 
 All of it is the plant's, the drives' and the bus's alone: the controller is told nothing. `[plant]` in a scenario, or a
-file for `python -m firmware_sim --plant FILE`. Where it says nothing the arm is as described, with ideal brakes.
+file for `python -m firmware_sim --plant FILE`. Where it says nothing the arm is as described; brakes are ideal where
+the robot file says that there are any.
 """
 
 import math
@@ -69,7 +70,7 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
         static=tuple(map(max, _each(table, "static_Nm", n, 0.0, _within(0.0, 1000.0)), coulomb)),
         viscous=_each(table, "viscous_Nms_rad", n, 0.0, _within(0.0, 1000.0)),
         torque_gain=_each(table, "torque_gain", n, 1.0, _within(0.0, 2.0)),
-        brake=_each(table, "brake", n, "ideal", _brake),
+        brake=_each(table, "brake", n, ["ideal" if j.brake else "none" for j in settings.joints], _brake),
         encoder_zero=_each(table, "encoder_zero_rad", n, [j.zero for j in settings.joints], _within(-100.0, 100.0)),
         encoder_direction=_each(table, "encoder_direction", n, [j.direction for j in settings.joints], _direction),
         reply_loss=_one(table, "reply_loss", 0.0, _within(0.0, 1.0)),

@@ -4,6 +4,7 @@ The file is checked by `rtctl check`; here a missing or wrong key is simply a Se
 """
 
 import math
+import os
 import site
 import sys
 import tomllib
@@ -42,6 +43,7 @@ class JointSetting(NamedTuple):
     coulomb: float  # [Nm]
     direction: float  # 1 or -1: the drive reads direction * q + zero
     zero: float  # [rad]
+    brake: bool  # a holding brake: kits' drives have none
 
 
 class Tool(NamedTuple):
@@ -77,9 +79,11 @@ class Settings(NamedTuple):
 
 
 def package_dirs() -> tuple[Path, ...]:
-    """Return the folders that `package://` names are looked for in: shares of wheels that carry robot descriptions."""
+    """Return the folders that `package://` names are looked for in: shares of wheels, then ROS's own."""
+    ros = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
     roots = [*map(Path, site.getsitepackages()), *(Path(p) for p in sys.path if p.endswith("site-packages"))]
-    return tuple(dict.fromkeys(r / "cmeel.prefix" / "share" for r in roots if (r / "cmeel.prefix" / "share").is_dir()))
+    shares = [*(r / "cmeel.prefix" / "share" for r in roots), *ros]
+    return tuple(dict.fromkeys(share for share in shares if share.is_dir()))
 
 
 def resolve(name: str, beside: Path, packages: tuple[Path, ...]) -> Path:
@@ -161,6 +165,11 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
                 float(j.get("friction", {}).get("coulomb_Nm", 0.0)),
                 float(j.get("direction", 1)),
                 float(j.get("zero_rad", 0.0)),
+                bool(
+                    j.get(
+                        "brake", j["drive"] in file.get("drives", {}) and file["drives"][j["drive"]].get("brake", True)
+                    )
+                ),
             )
             for j in robot["joints"]
         ),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from firmware_sim.reality import Reality
 from firmware_sim.settings import Settings, SettingsError, Tool, resolve
 
+PACKAGES_ABOVE = 4  # folders above a URDF that may hold the packages that its meshes name
 STOP = 0.1  # [rad or m] mechanical stop outside the permitted range
 WORLD = "plant_world"
 PAYLOAD, TOOL = "plant_payload", "plant_tool"
@@ -32,7 +33,8 @@ def rewrite(settings: Settings, reality: Reality) -> str:
         for visual in link.findall("visual"):
             link.remove(visual)
     for mesh in root.iter("mesh"):
-        mesh.set("filename", str(resolve(mesh.get("filename", ""), settings.urdf.parent, settings.package_dirs)))
+        packages = (*settings.package_dirs, *list(settings.urdf.parents)[:PACKAGES_ABOVE])
+        mesh.set("filename", str(resolve(mesh.get("filename", ""), settings.urdf.parent, packages)))
     for joint in root.findall("joint"):
         for tag in ("dynamics", "mimic", "safety_controller"):
             for element in joint.findall(tag):

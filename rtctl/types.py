@@ -42,6 +42,8 @@ class Verb(IntEnum):
     RESET = 4
     RECOVER = 5
     TERM = 6
+    DROP = 7  # disarm an arm that falls then
+    PARK = 8  # move to where an arm rests without torque, then disarm
     FLOAT = 10  # let a hand move the arm
     HOLD = 11  # stay here, without a goal
 
@@ -112,6 +114,7 @@ class Drive(IntEnum):
     ENABLE = 1
     TORQUE = 2
     CLEAR = 3  # clear a latched drive fault
+    HOLD = 4  # the drives' own loops, see `Hold`
 
 
 class Task(IntFlag, boundary=STRICT):
@@ -202,11 +205,22 @@ class Feedback(NamedTuple):
     compute: float  # [s] of the previous tick; logged, never used by the law
 
 
+class Hold(NamedTuple):
+    """What the drives do by themselves, on their own encoders: tau_i = kp (p - q) + kd (v - qd) + the command's."""
+
+    p: F64  # (n,) [rad]
+    v: F64  # (n,) [rad/s]
+    kp: F64  # (n,) [Nm/rad]
+    kd: F64  # (n,) [Nms/rad]
+    off: B1  # (n,) joints that cannot be held: their drives are disabled
+
+
 class Command(NamedTuple):
     """What goes to the drives."""
 
     drive: Drive
     tau: F64  # (n,) [Nm]
+    hold: Hold | None = None  # of Drive.HOLD
 
 
 class Frames(Sequence[bytes]):

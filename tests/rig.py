@@ -109,7 +109,7 @@ def config_at(
     (folder / "run").mkdir(mode=0o700, exist_ok=True)
     bus = {"interface": '"socketcan"', "channel": f'"{can}"'} if can else {"channel": f'"{folder}/bus"'}
     source = PANDA.with_stem(robot)
-    text = source.read_text().replace(f'urdf = "{robot}.urdf"', f'urdf = "{source.with_suffix(".urdf")}"')
+    text = re.sub(r'(?m)^urdf = "(\w+\.urdf)"', lambda m: f'urdf = "{source.with_name(m[1])}"', source.read_text())
     for key, value in {**bus, **QUICK, "directory": f'"{folder}/logs"', **(changes or {})}.items():
         text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
         assert count == 1, key

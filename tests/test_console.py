@@ -88,12 +88,24 @@ def round_trip(daemon: Daemon, message: Any, ok: bool = True, text: str = "") ->
 
 @pytest.mark.parametrize(
     ("word", "verb"),
-    [("arm", Verb.ARM), ("disarm", Verb.DISARM), ("stop", Verb.STOP), ("reset", Verb.RESET), ("recover", Verb.RECOVER)],
+    [
+        ("arm", Verb.ARM),
+        ("disarm", Verb.DISARM),
+        ("park", Verb.PARK),
+        ("stop", Verb.STOP),
+        ("reset", Verb.RESET),
+        ("recover", Verb.RECOVER),
+    ],
 )
 def test_each_verb_reaches_exactly_one_tick(daemon: Daemon, word: str, verb: Verb) -> None:
     reply, requests = round_trip(daemon, {"verb": word})
     assert [r.verb for r in requests] == [verb]
     assert reply["ok"] is True
+
+
+def test_a_disarm_that_may_drop_the_arm_is_another_than_one_that_may_not(daemon: Daemon) -> None:
+    assert [r.verb for r in round_trip(daemon, {"verb": "disarm", "drop": True})[1]] == [Verb.DROP]
+    assert [r.verb for r in round_trip(daemon, {"verb": "disarm", "drop": False})[1]] == [Verb.DISARM]
 
 
 def test_the_reply_carries_the_verdict_of_the_tick_that_got_the_request(daemon: Daemon) -> None:

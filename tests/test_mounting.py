@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_sim import codec
 from rtctl import design as cfg
 from rtctl.app.arm_link import link_spec
 from rtctl.app.sim import simulate
@@ -15,7 +16,7 @@ from rtctl.hal.can.link import CanLink, LinkSpec
 from rtctl.hal.can.transport import InProcess
 from rtctl.protocol import batch, e2e, frame, mit
 from rtctl.protocol.mounting import Mounting, Wiring
-from rtctl.types import Frames
+from rtctl.types import Command, Drive, Frames, Hold
 from tests.fake_drives import FakeDrives, spec_of
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -38,6 +39,25 @@ def reading(q: float, m: Mounting) -> int:
 
 
 # ---- the codec
+
+
+@pytest.mark.parametrize("protected", [False, True])
+def test_what_the_drives_loops_are_asked_for_is_in_their_own_coordinates(protected: bool) -> None:
+    spec = as_mounted(spec_of(N, "mit+e2e" if protected else "mit"), MOUNTINGS)
+    link = CanLink(spec, InProcess(lambda frames: []))
+    link.turn(tuple(m.turns for m in MOUNTINGS))
+    q, qd, tau = np.array([0.5, -1.0, 2.0]), np.array([1.0, -2.0, 0.5]), np.array([3.0, -7.0, 0.0])
+    kp, kd = np.array([0.0, 120.0, 500.0]), np.array([5.0, 0.0, 1.25])
+    hold = Hold(q, qd, kp, kd, np.array([False, False, True]))
+    sent = [frame.unpack(raw) for raw in link.write(Command(Drive.HOLD, tau, hold))]
+    assert [f.can_id for f in sent] == [j + 1 for j in range(N)]
+    for j, m in enumerate(MOUNTINGS[:2]):  # read by the virtual drives' own codec
+        got = codec.decode_command(sent[j].data[:8], codec.Scale(*spec.joints[j].scale))
+        wanted = m.direction * q[j] + m.zero + TURN * m.turns, m.direction * qd[j], kp[j], kd[j], m.direction * tau[j]
+        steps = (STEP[0], STEP[1], 500.0 / 4095.0, 5.0 / 4095.0, STEP[2])
+        assert all(abs(a - b) <= 0.5001 * s for a, b, s in zip(got[1:], wanted, steps, strict=True))
+        assert not protected or (codec.intact(sent[j].data, j + 1) and sent[j].data[9] & codec.TORQUE_WANTED)
+    assert codec.decode_command(sent[2].data[:8], codec.Scale(*SCALE)).special == codec.DISABLE
 
 
 @pytest.mark.parametrize("protected", [False, True])

@@ -15,7 +15,7 @@ from firmware_sim.settings import load
 
 F64 = NDArray[np.float64]
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-ARMS = ("panda", "ur5", "openarm", "puma560", "planar4")
+ARMS = ("panda", "ur5", "openarm_e2e", "puma560", "planar4")
 NOISE = 1e-4  # [m] of pybullet's distances
 
 

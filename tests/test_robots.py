@@ -22,7 +22,7 @@ from tests.arms import NO_POINTS
 from tests.lab import ROOT, at_rest, healthy, play, robot
 from tests.rig import Rig, until
 
-NAMES = ("planar4", "puma560", "ur5", "openarm")
+NAMES = ("planar4", "puma560", "ur5", "openarm_e2e")
 # a, d, alpha, mass, centre of mass and diagonal of the inertia in DH frame i (Corke and Armstrong-Helouvry 1994)
 PUMA = (
     (0.0, 0.67183, np.pi / 2, 0.0, (0.0, 0.0, 0.0), (0.0, 0.35, 0.0)),
@@ -113,13 +113,15 @@ def test_the_puma_is_where_its_denavit_hartenberg_table_says():
 
 
 def test_openarm_is_where_its_joint_table_says():
-    for q in postures("openarm"):
-        m, X = model_at("openarm", q), openarm_frames(q)[-1] @ transform(np.eye(3), (1e-6, 0.0205, 0.0))
+    for q in postures("openarm_e2e"):
+        m, X = model_at("openarm_e2e", q), openarm_frames(q)[-1] @ transform(np.eye(3), (1e-6, 0.0205, 0.0))
         np.testing.assert_allclose(m.x, X[:3, 3], atol=1e-12)
         np.testing.assert_allclose(m.R, X[:3, :3], atol=1e-12)
 
 
-@pytest.mark.parametrize(("name", "kg"), [("planar4", 8.0), ("puma560", 23.45), ("ur5", 16.9939), ("openarm", 4.3749)])
+@pytest.mark.parametrize(
+    ("name", "kg"), [("planar4", 8.0), ("puma560", 23.45), ("ur5", 16.9939), ("openarm_e2e", 4.3749)]
+)
 def test_the_moving_links_weigh_what_is_published(name: str, kg: float):
     assert sum(i.mass for i in list(arm(name).body.model.inertias)[1:]) == pytest.approx(kg, abs=1e-9)
 
@@ -149,14 +151,14 @@ def test_the_puma_s_inertia_is_the_links_kinetic_energy_and_its_motors():
 
 def test_openarm_s_gravity_is_the_slope_of_its_potential_energy():
     eps = 1e-6
-    for q in postures("openarm", 3):
+    for q in postures("openarm_e2e", 3):
 
         def height(p: F64) -> float:
             frames = openarm_frames(p)
             return sum(9.81 * mass * (X @ (*c, 1.0))[2] for X, (_, _, mass, c) in zip(frames, OPENARM, strict=True))
 
         slope = [(height(q + eps * e) - height(q - eps * e)) / (2.0 * eps) for e in np.eye(7)]
-        np.testing.assert_allclose(model_at("openarm", q).g, slope, atol=1e-6)
+        np.testing.assert_allclose(model_at("openarm_e2e", q).g, slope, atol=1e-6)
 
 
 def test_planar4_s_inertia_is_that_of_slender_rods():
@@ -185,8 +187,8 @@ def test_check_has_no_more_to_say_than_that_a_simulation_is_not_real_time(name: 
 
 def test_the_damiao_drives_have_their_makers_scales_on_both_ends_of_the_wire():
     wanted = [(12.5, 45.0, 54.0)] * 2 + [(12.5, 8.0, 28.0)] * 2 + [(12.5, 30.0, 10.0)] * 3
-    assert [tuple(s) for s in cfg.scales(cfg.load(config_of("openarm")))] == wanted
-    assert [tuple(r.scale) for r in load_settings(config_of("openarm")).ratings] == wanted
+    assert [tuple(s) for s in cfg.scales(cfg.load(config_of("openarm_e2e")))] == wanted
+    assert [tuple(r.scale) for r in load_settings(config_of("openarm_e2e")).ratings] == wanted
 
 
 def test_the_puma_s_motors_are_those_of_the_table():
@@ -219,6 +221,33 @@ def test_the_plant_accelerates_as_pinocchio_does_with_motors_and_friction(name: 
             got = (np.array(plant.qd) - qd) / (plant.step_ns * 1e-9)
             wanted = pin.aba(body.model, body.data, q, qd, tau - friction * qd)
             np.testing.assert_allclose(got, wanted, rtol=2e-3, atol=2e-2)
+    finally:
+        plant.close()
+
+
+@pytest.mark.parametrize("name", ["puma560", "openarm_e2e"])
+@pytest.mark.parametrize("held", [(1,), (0, 2)])
+def test_joints_that_their_brakes_hold_leave_the_others_an_inertia_without_theirs(name: str, held: tuple[int, ...]):
+    """(A + J)_ff qdd_f = (tau - B qd - h - g)_f of the free joints f: what is held neither moves nor turns its motor."""
+    body, settings, n = arm(name).body, load_settings(config_of(name)), arm(name).n
+    free = [j for j in range(n) if j not in held]
+    friction = np.array([j.friction for j in settings.joints])
+    plant, rng = Plant(settings, settings.home, []), np.random.default_rng(3)
+    drag = [1e4 if j in held else 0.0 for j in range(n)]
+    try:
+        for q in 0.6 * postures(name, 3) + 0.4 * arm(name).home:
+            qd, tau = rng.uniform(-0.5, 0.5, n), rng.uniform(-0.2, 0.2, n) * arm(name).tau_max
+            qd[list(held)], tau[list(held)] = 0.0, 0.0
+            plant.place(q)
+            put_speed(plant, q, qd)
+            plant.step(tau.tolist(), drag)
+            got = (np.array(plant.qd) - qd) / (plant.step_ns * 1e-9)
+            A = pin.crba(body.model, body.data, q)
+            A = np.triu(A) + np.triu(A, 1).T
+            bias = pin.nonLinearEffects(body.model, body.data, q, qd)
+            wanted = np.linalg.solve(A[np.ix_(free, free)], (tau - friction * qd - bias)[free])
+            np.testing.assert_allclose(got[free], wanted, rtol=5e-3, atol=5e-2)
+            assert np.abs(np.array(plant.qd)[list(held)]).max() < 1e-3
     finally:
         plant.close()
 
@@ -293,7 +322,7 @@ RUNS: dict[str, tuple[list[float], dict[str, Any]]] = {
     ),
     "puma560": ([0.58, 0.15, 1.05], {"type": "sphere", "radius_m": 0.06, "position_m": [0.72, 0.02, 1.12]}),
     "ur5": ([0.50, 0.35, 0.28], {"type": "box", "size_m": [0.08, 0.08, 0.3], "position_m": [0.66, 0.24, 0.2]}),
-    "openarm": (
+    "openarm_e2e": (
         [0.1, 0.32, 0.25],
         {"type": "capsule", "radius_m": 0.02, "length_m": 0.25, "position_m": [0.32, 0.26, 0.15]},
     ),

@@ -109,7 +109,7 @@ def test_a_scenario_is_the_same_for_ever_and_from_its_file(tmp_path: Path):
     assert scenario_of(arm, config, 1, 0) != scenario_of(arm, config, 0, 0)
 
 
-@pytest.mark.parametrize("name", ["planar4", "puma560", "panda", "ur5", "openarm"])
+@pytest.mark.parametrize("name", ["planar4", "puma560", "panda", "ur5", "openarm_e2e"])
 def test_a_scenario_of_each_robot_breaks_nothing(name: str):
     arm, config = robot_of(name)
     table = scenario_of(arm, config, 0, 1) | {"duration_s": BRIEF}
@@ -120,7 +120,7 @@ def test_a_scenario_of_each_robot_breaks_nothing(name: str):
 
 
 @pytest.mark.parametrize(
-    ("name", "index", "until"), [("ur5", 10, 1.0), ("openarm", 66, 0.9), ("ur5", 20, 2.2), ("panda", 80, 6.3)]
+    ("name", "index", "until"), [("ur5", 10, 1.0), ("openarm_e2e", 66, 0.9), ("ur5", 20, 2.2), ("panda", 80, 6.3)]
 )
 def test_what_went_wrong_once_holds(name: str, index: int, until: float):
     """A forearm that meets its own shoulder at v_max; a way past a singularity, with joints fit for 17 rad/s; a folded

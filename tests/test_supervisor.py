@@ -29,11 +29,12 @@ def test_only_an_operator_leaves_a_latched_state(state):
         for events in itertools.combinations(Event, size):
             after, event = next_state(state, set(events))
             if after not in LATCHED:
-                assert event in (Event.RESET, Event.TERM)
+                assert event in (Event.RESET, Event.RESUME, Event.TERM)
 
 
-def test_run_is_entered_only_through_armed_and_armed_only_by_the_operator():
-    assert [k for k, v in TABLE.items() if v == State.RUN] == [(State.ARMED, Event.SETTLED)]
+def test_run_is_entered_through_armed_or_by_a_reset_of_what_would_fall_and_armed_only_by_the_operator():
+    ways = {k for k, v in TABLE.items() if v == State.RUN}
+    assert ways == {(State.ARMED, Event.SETTLED), (State.SAFE_STOP, Event.RESUME)}
     assert [k for k, v in TABLE.items() if v == State.ARMED] == [(State.IDLE, Event.ARM)]
 
 
@@ -61,13 +62,13 @@ def test_without_events_nothing_changes():
 
 # Every row as the published table of states has it: where each event leads; - where it means nothing.
 WHERE = """
-           STO    SS1        SS2        TERM      STOP       DISARM    RESET     ARM    TIMEOUT  SETTLED  RESTED
-IDLE       FAULT  -          -          IDLE      -          -         IDLE      ARMED  -        -        -
-ARMED      FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      IDLE     RUN      -
-RUN        FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      -        -        -
-STOPPING   FAULT  SAFE_STOP  -          -         SAFE_STOP  -         -         -      -        -        IDLE
-SAFE_STOP  FAULT  SAFE_STOP  -          STOPPING  -          -         STOPPING  -      -        -        -
-FAULT      -      -          -          IDLE      -          -         IDLE      -      -        -        -
+           STO    SS1        SS2        TERM      STOP       DISARM    RESET     ARM    TIMEOUT  SETTLED  RESTED  RESUME
+IDLE       FAULT  -          -          IDLE      -          -         IDLE      ARMED  -        -        -       -
+ARMED      FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      IDLE     RUN      -       -
+RUN        FAULT  SAFE_STOP  SAFE_STOP  STOPPING  SAFE_STOP  STOPPING  -         -      -        -        -       -
+STOPPING   FAULT  SAFE_STOP  -          -         SAFE_STOP  -         -         -      -        -        IDLE    -
+SAFE_STOP  FAULT  SAFE_STOP  -          STOPPING  -          -         STOPPING  -      -        -        -       RUN
+FAULT      -      -          -          IDLE      -          -         IDLE      -      -        -        -       -
 """
 ROWS = [line.split() for line in WHERE.strip().splitlines()]
 CELLS = [
@@ -183,7 +184,21 @@ def test_arm_and_recover_both_arm_and_each_other_verb_is_its_own_event():
         Verb.DISARM: Event.DISARM,
         Verb.STOP: Event.STOP,
         Verb.RESET: Event.RESET,
+        Verb.DROP: Event.DISARM,
+        Verb.PARK: Event.DISARM,
     }
+
+
+def test_a_reset_of_what_would_fall_goes_on_holding_it_unless_a_fault_is_left():
+    held = session(State.SAFE_STOP, BRAKE, Severity.SS2)
+    assert supervisor_step(RULES, held, asked(Verb.RESET, falls=True)).session.state == State.RUN
+    left = supervisor_step(RULES, held, asked(Verb.RESET, present=BRAKE, falls=True))
+    assert left.session.state == State.SAFE_STOP
+    assert left.refusal
+    for verb in (Verb.DISARM, Verb.STOP, Verb.ARM):  # nothing but a reset is another for it
+        there = session(State.RUN)
+        one, other = (supervisor_step(RULES, there, asked(verb, falls=falls)) for falls in (False, True))
+        assert one == other
 
 
 def test_reasons_come_in_their_order_what_the_vehicle_lacks_first():

@@ -29,14 +29,14 @@ SCENARIOS = {
     "planar4": "scenarios/planar4",
     "puma560": "scenarios/puma560",
     "ur5": "scenarios/ur5",
-    "openarm": "scenarios/openarm",
+    "openarm_e2e": "scenarios/openarm_e2e",
 }
 FOREARMS = {
     "panda": "panda_link5",
     "planar4": "link_3",
     "puma560": "link_4",
     "ur5": "forearm_link",
-    "openarm": "link_5",
+    "openarm_e2e": "link_5",
 }
 CENTRE = 0.05  # [m] of a payload from the tip, each way
 PUSH_TIME = 0.3  # [s]

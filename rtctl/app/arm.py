@@ -41,12 +41,14 @@ from rtctl.log.entry import Kind
 from rtctl.log.record.checkpoint import encode_checkpoint
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario
-from rtctl.types import Command, Drive, Feedback, ObstacleEdit, Status, Task
+from rtctl.types import F64, Command, Drive, Feedback, Hold, ObstacleEdit, Status, Task
 from rtctl.world import obstacle_table
 
 ArmServo: TypeAlias = Servo[Robot, Memory, Feedback, Command]
 Bus: TypeAlias = Link[Feedback, Command]
 CAN_TX, CAN_RX = int(Kind.CAN_TX), int(Kind.CAN_RX)
+SINK_RATE, SINK_TIME = 1.0, 8.0  # [1/s], [s] in which an arm without brakes sinks when the controller has failed
+SLOW = 0.3  # [rad/s] of a joint that is held or lowered at most
 REST_SPEED, REST_TIME = 0.03, 0.1  # [rad/s], [s] all joints below it: the arm rests
 
 
@@ -89,6 +91,8 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         )
     if after.state != before.state:
         found.append(("state", after.state.name))
+    if after.own_phase:
+        found += unheld(robot, before, after, feedback)
     if not np.array_equal(after.payload, before.payload):
         mass, x, y, z = after.payload
         found.append(("payload", f"{mass:g} kg at {x:g} {y:g} {z:g} m of the tip" if mass > 0.0 else "none"))
@@ -96,6 +100,23 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("hold", "no hand guides the arm any more"))
     if (after.status, after.blockers) != (before.status, before.blockers) and after.status != Status.NO_GOAL:
         found.append((after.status.name.lower(), "; ".join(after.blocked_by)))
+    return found
+
+
+def unheld(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> list[Event]:
+    """Return which joints of an arm without brakes its drives can newly not hold, and why."""
+    found = []
+    for i, joint in enumerate(robot.joints):
+        lost = after.lost & ~before.lost & 1 << i
+        if lost and feedback.drive[i] != 1:
+            found.append(("cannot_hold", f"{joint}: its drive gives no torque; the others are held"))
+        elif lost:
+            found.append(("cannot_hold", f"{joint}: its encoder is not to be trusted; the others are held"))
+        elif after.no_position & ~before.no_position & 1 << i and not after.no_speed & 1 << i:
+            most = robot.stop.kd[i] * SLOW
+            found.append(("cannot_hold", f"{joint}: damped alone, which carries {most:.2g} Nm at {SLOW:g} rad/s"))
+        elif not before.own_phase and feedback.replies[i] == 0:
+            found.append(("cannot_hold", f"{joint}: is silent; whether its drive holds it is not known"))
     return found
 
 
@@ -141,7 +162,8 @@ def misplaced(robot: Robot, m: Memory, edit: ObstacleEdit) -> str:
 def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slot], lockstep: bool) -> None:
     """A turn raised: damp with the last gravity torque until the arm rests, then leave the drives disabled.
 
-    -D qd + g through the limiter, from the feedback alone: nothing of the tick that failed is used.
+    -D qd + g through the limiter, from the feedback alone: nothing of the tick that failed is used. An arm without
+    brakes then sinks, by the drives' own loops.
     """
     g, sent, rest, driven, heard = m.model.g, m.sent[0], 0, True, True
     bounds = TorqueBounds(robot.tau_max, robot.tau_rate, robot.tau_lsb, robot.stop.damping)
@@ -150,12 +172,31 @@ def fallback(robot: Robot, m: Memory, link: Bus, sink: Sink, slots: Iterator[Slo
         sink.put_many(CAN_RX, link.received, time.monotonic_ns())
         driven = bool((feedback.drive == 1).all()) if k == 0 else driven
         rest = rest + 1 if bool((np.abs(feedback.qd) < REST_SPEED).all()) else 0
-        if not driven or rest * robot.dt > REST_TIME or k * robot.dt > robot.stop.time:
+        if not driven:
+            return
+        if rest * robot.dt > REST_TIME or k * robot.dt > robot.stop.time:
+            if robot.brakeless:
+                _sink(robot, feedback.q, g, link, sink, slots, lockstep)
             return
         keep = g - robot.stop.damping * feedback.qd
         reference = slew_reference(sent, feedback.tau, robot.tau_rate, robot.tau_lsb, robot.dt, 1)
         sent = limit_torque(TorqueParts(np.zeros(robot.n), keep), feedback.qd, reference, bounds, robot.dt).tau
         sink.put_many(CAN_TX, link.write(Command(Drive.TORQUE, sent)), time.monotonic_ns())
+        if lockstep:
+            heard = link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
+
+
+def _sink(robot: Robot, q: F64, g: F64, link: Bus, sink: Sink, slots: Iterator[Slot], lockstep: bool) -> None:
+    """Have the drives hold the arm at q (n,) [rad], with gravity g (n,) [Nm], ever more softly."""
+    zero, nobody, heard = np.zeros(robot.n), np.zeros(robot.n, np.bool_), True
+    for k, slot in enumerate(slots):
+        if k * robot.dt > SINK_TIME:
+            return
+        link.read(slot.slot, slot.missed, slot.lateness, 0.0)
+        sink.put_many(CAN_RX, link.received, time.monotonic_ns())
+        left = float(np.exp(-SINK_RATE * k * robot.dt))
+        hold = Hold(q, zero, left * robot.stop.kp, robot.stop.kd, nobody)
+        sink.put_many(CAN_TX, link.write(Command(Drive.HOLD, left * g, hold)), time.monotonic_ns())
         if lockstep:
             heard = link.wait_replies(LOCKSTEP_WAIT if heard else LOCKSTEP_SILENT)
 

@@ -52,7 +52,7 @@ REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
 _BARE = (  # of Robot
     "q_min", "q_max", "qd_max", "tau_max", "tau_rate", "tau_lsb", "braking", "viscous", "q_rest", "dt", "model_dt",
     "carry", "escape", "payload_max", "friction_max", "noticeable", "tolerance", "tolerance_rot", "coulomb",
-    "viscous_told", "collision", "collision_hard",
+    "viscous_told", "collision", "collision_hard", "brakeless",
 )  # fmt: skip
 
 # rows of Law.torques, (7, n) [Nm]; the first five as the record has them

@@ -23,7 +23,7 @@ from rtctl.arm.disturbance import (
 from rtctl.arm.friction import GUIDED, rubbing, sliding, speeds_of
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import drives_torque
-from rtctl.arm.target import target_of
+from rtctl.arm.target import parking_progress, target_of
 from rtctl.arm.task import task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
@@ -65,7 +65,7 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
         m.external_moving[i] += (follow if moved else drift) * (external[i] - m.external_moving[i])
     if m.state != _RUN:
         return  # a stop goes on with what was known
-    m.settled = 1 if m.floating == 0 and settled(m.settled != 0, resting, _error(c, m)) else 0
+    m.settled = 1 if m.floating == 0 and settled(m.settled != 0, resting, _error(c, m, n)) else 0
     bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
     if m.floating != 0:  # what a hand does is not learnt: the weight found before, where the tip is now
         m.lasting[:n] = within(m.float_weight * model.J[2] + m.float_rest[:n], bound)
@@ -77,8 +77,11 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
 
 
 @kernel
-def _error(c: RecordRow, m: RecordRow) -> float:
+def _error(c: RecordRow, m: RecordRow, n: int) -> float:
     """Return how far the tip is from where it shall be, in tolerances."""
+    if m.parking != 0:
+        away: float = parking_progress(m, n).error_rot / max(m.goal_tolerance_rot, FINE_ROT)
+        return away
     target = target_of(m, m.has_goal != 0)
     e, e_rot = task_error(target.task, target.axis, target.position, target.wxyz, m.x.copy(), m.R.copy())
     near = max(target.tolerance if target.tolerance > 0.0 else c.tolerance, FINE)

@@ -40,6 +40,20 @@ HOT = np.dtype(
             ("in_force", _INT),  # bits of the faults
             ("good", _INT, (FAULTS_MAX,)),  # ticks since each was present
             ("counters", _INT, (len(Counters._fields),)),
+            ("parking", _INT),  # the goal is to park, then to disarm
+            # a stop by the drives' own loops; see `own_loop`
+            ("sinks", _INT),  # STOPPING lowers the arm before it cuts the torque
+            ("own_phase", _INT),
+            ("own_since", _INT),  # tick of its beginning
+            ("own_p", _REAL, _JOINT),  # [rad]
+            ("own_v", _REAL, _JOINT),  # [rad/s]
+            ("own_kp", _REAL, _JOINT),  # [Nm/rad]
+            ("own_kd", _REAL, _JOINT),  # [Nms/rad]
+            ("own_t", _REAL, _JOINT),  # [Nm] the torque beside
+            ("own_g", _REAL, _JOINT),  # [Nm] of it gravity's
+            ("lost", _INT),  # bits of the joints that cannot be held
+            ("no_position", _INT),  # bits of the joints whose position is untrue
+            ("no_speed", _INT),  # and whose speed is
             ("clear_until", _INT),  # tick until which latched drive faults are being cleared
             ("recovering", _INT),  # armed outside the joint limits, on request
             ("outside", _INT),  # a joint is beyond its limits
@@ -132,6 +146,12 @@ _NAMES = frozenset(HOT.names or ())
 _COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes")
 _JOINTS = (
     "onset",
+    "own_p",
+    "own_v",
+    "own_kp",
+    "own_kd",
+    "own_t",
+    "own_g",
     "qdd",
     "q_previous",
     "age_previous",
@@ -149,6 +169,8 @@ _JOINTS = (
 )
 _FLAGS = (
     "off",
+    "sinks",
+    "parking",
     "recovering",
     "outside",
     "leaving",

@@ -42,6 +42,7 @@ from rtctl.types import (
     Drive,
     Feedback,
     Goal,
+    Hold,
     ObstacleEdit,
     Record,
     Request,
@@ -55,7 +56,7 @@ from rtctl.types import (
 from rtctl.world import obstacle_table, primitives
 
 ZERO = np.zeros(3)
-DRIVES = tuple(Drive(i) for i in range(4))  # an enumeration looks its numbers up slowly
+DRIVES = tuple(Drive(i) for i in range(5))  # an enumeration looks its numbers up slowly
 
 
 def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> tuple[Memory, Command, Record]:
@@ -92,7 +93,17 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
     record.flags.writeable = False
-    return m, Command(DRIVES[record["command"].item()], record_of(hot)["sent"][0, 0, : robot.n]), record
+    return m, _command(DRIVES[record["command"].item()], hot, robot.n), record
+
+
+def _command(drive: Drive, hot: F64, n: int) -> Command:
+    """Return what goes to the drives of n joints."""
+    h = record_of(hot)
+    if drive != Drive.HOLD:
+        return Command(drive, h["sent"][0, 0, :n])
+    off = (h["lost"][0] >> np.arange(n) & 1).astype(np.bool_) & (h["own_t"][0, :n] == 0.0)
+    p, v, kp, kd, t = (h[name][0, :n] for name in ("own_p", "own_v", "own_kp", "own_kd", "own_t"))
+    return Command(drive, t, Hold(p, v, kp, kd, off))
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
@@ -278,6 +289,7 @@ def warm(robot: Robot) -> None:
     quat_of(exp3(between(TOOL_Z, -TOOL_Z)))  # of a goal that names a direction
     stopping = m._replace(state=State.SAFE_STOP, reaction=Severity.SS1)
     tick(robot, stopping, feedback, Request())
+    tick(robot._replace(brakeless=True), stopping, feedback, Request())
 
 
 def _warm_competence(robot: Robot, moving: Memory, feedback: Feedback) -> None:

@@ -22,6 +22,9 @@ class StopParams(NamedTuple):
     """How the arm is brought to rest when it must stop."""
 
     damping: F64  # (n,) [Nms/rad] D of the damped stop -D qd + g(q): A_ii(home) times the rate of decay
+    decay: float  # [1/s] with which a stopping joint loses its speed
+    kp: F64  # (n,) [Nm/rad] of the drives' own loops, where they hold the arm
+    kd: F64  # (n,) [Nms/rad]
     time: float  # [s] a damped stop cuts torque after this at the latest
     frames: int  # disable frames sent at start and at the end
     stall: float  # [s] at rest short of the goal before it is diagnosed
@@ -86,6 +89,10 @@ class Robot(NamedTuple):
     scratch: Field  # work arrays of the field, overwritten every tick
     tolerance: float  # [m] of a goal that gives none
     tolerance_rot: float  # [rad]
+    park: F64 | None = None  # (n,) [rad] where it rests without torque
+    park_on_exit: bool = False  # SIGTERM parks it
+    urdf: str = ""  # its file
+    brakeless: bool = False  # some joint has no brake: without torque the arm falls
     axes: Task = Task.POSE  # of the tip that the arm can move
     meshes: Meshes = NONE  # that obstacles may refer to
     carry: bool = True  # tip and points are estimated between evaluations; else held still

@@ -65,16 +65,17 @@ class Surroundings(NamedTuple):
 @kernel
 def drives_torque(m: RecordRow) -> bool:
     """Return whether the state wants torque from the drives."""
-    if m.state == _SAFE_STOP:
+    if m.state == _SAFE_STOP or m.state == _STOPPING:
         return bool(m.off == 0)
-    return bool(m.state == _ARMED or m.state == _RUN or m.state == _STOPPING)
+    return bool(m.state == _ARMED or m.state == _RUN)
 
 
 @kernel
 def plausible_feedback(c: RecordRow, m: RecordRow, f: Feedback) -> tuple[Feedback, bool]:
     """Return the feedback with silence in place of positions that no joint can have reached, and whether any is.
 
-    A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump.
+    A joint that goes on reporting such positions stays silent: the filter that damps it must not see the jump. So does
+    one whose position a stop has found to be untrue.
     """
     n = f.q.shape[0]
     q, age, replies, implausible = f.q.copy(), f.age.copy(), f.replies.copy(), False
@@ -82,8 +83,11 @@ def plausible_feedback(c: RecordRow, m: RecordRow, f: Feedback) -> tuple[Feedbac
         elapsed, before = c.dt * (1 + f.missed), m.age_previous[:n]
         found = implausible_positions(f.q, f.age, f.replies, m.q_previous[:n], before, c.qd_max[:n], elapsed, c.dt)
         for i in range(n):
-            if found[i]:
-                implausible = True
+            if found[i] and m.own_phase != 0:  # it may be as fast as that: a joint that is let go is not bound
+                apart = max(elapsed + before[i] - f.age[i], c.dt)
+                found[i] = abs(f.q[i] - m.q_previous[i] - f.qd[i] * apart) > 0.05
+            if found[i] or m.no_position >> i & 1:
+                implausible = implausible or found[i]
                 q[i], age[i], replies[i] = m.q_previous[i], min(before[i] + elapsed, c.safety_lost_periods * c.dt), 0
     return (
         Feedback(f.slot, f.missed, q, f.qd, f.tau, age, replies, f.drive, f.link, f.lateness, f.compute),
@@ -132,6 +136,10 @@ def predict(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     qdd = m.qdd[:n].copy()
     joints, surprise = joint_step(_joints(m, n), qdd, f.q, f.qd, f.age, f.replies, elapsed, _joint_filter(c, n))
     m.q[:n], m.qd[:n], m.P[:n] = joints.q, joints.qd, joints.P
+    for i in range(n):
+        if m.no_position >> i & 1:  # predicted alone: it falls no further than its stops
+            q = min(max(m.q[i], c.q_min[i]), c.q_max[i])
+            m.q[i], m.qd[i] = q, m.qd[i] if q == m.q[i] else 0.0
     m.innovation = largest(surprise)
     if c.carry != 0.0:
         _put_tip(m, predict_by_model(_tip(m), model.J, model.Jdqd, qdd, elapsed, _estimator(c)))

@@ -20,15 +20,16 @@ from rtctl.arm.loads import loaded, observe, pushed
 from rtctl.arm.memory import HOT
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
+from rtctl.arm.own_loop import given, holds_itself, own_loop
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
 from rtctl.arm.robot import Arm
 from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torque, plausible_feedback, predict
-from rtctl.arm.target import progress_timers, pursues, target_of, wanted
+from rtctl.arm.target import parking_progress, progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
-from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Task
+from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Status, Task
 from rtctl.world.obstacle_table import distances_from, margins
 from rtctl.world.primitives import advanced_pose
 
@@ -54,8 +55,11 @@ STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushi
 _IDLE, _ARMED, _RUN, _STOPPING, _SAFE_STOP, _FAULT = (
     int(s) for s in (State.IDLE, State.ARMED, State.RUN, State.STOPPING, State.SAFE_STOP, State.FAULT)
 )
-_DISABLE, _ENABLE, _TORQUE, _CLEAR = (int(d) for d in (Drive.DISABLE, Drive.ENABLE, Drive.TORQUE, Drive.CLEAR))
+_DISABLE, _ENABLE, _TORQUE, _CLEAR, _HOLD = (
+    int(d) for d in (Drive.DISABLE, Drive.ENABLE, Drive.TORQUE, Drive.CLEAR, Drive.HOLD)
+)
 _SS1, _POSITION, _CHOOSING = int(Severity.SS1), int(Task.POSITION), int(Phase.CHOOSING)
+_MOVING = int(Status.MOVING)
 
 
 class Asked(NamedTuple):
@@ -76,9 +80,13 @@ def _uneventful(c: RecordRow, m: RecordRow, enabled: bool) -> bool:
     """Return whether nothing moves the supervisor: no fault that stops, and nothing whose time has come."""
     if m.in_force & STOPS or (m.in_force != 0 and (m.state == _SAFE_STOP or m.state == _FAULT)):
         return False
+    if m.state == _RUN and m.parking != 0 and m.status != _MOVING:
+        return False
     elapsed = (m.tick - m.since) * c.dt
     if m.state == _ARMED:
         return bool(elapsed < SETTLE if enabled else elapsed < ENABLE_TIMEOUT)
+    if m.state == _STOPPING and m.sinks != 0:
+        return bool(m.off == 0)
     if m.state == _STOPPING:
         rested = m.rest * c.dt >= REST_HOLD and elapsed >= REST_HOLD
         return bool(not rested and enabled and elapsed < STOP_TIME)
@@ -167,6 +175,21 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surrou
 
 
 @kernel
+def _held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings) -> tuple[int, F64]:
+    """Have the drives hold or lower the arm by their own loops; return types.Drive and the torque (n,) they give."""
+    n, noticed = f.q.shape[0], m.noticed != 0
+    own_loop(c, m, f, model, around, model.g - m.lasting[:n] if noticed else model.g)
+    tau = given(c, m, n) if m.off == 0 else np.zeros(n)
+    m.sent[1:, :n], m.sent[0, :n] = m.sent[:3, :n].copy(), tau
+    m.qdd[:n], m.slew_follows_echo = 0.0, 0
+    if m.off != 0:
+        return _DISABLE, tau
+    g = model.g - m.external[:n] if noticed else model.g
+    m.qdd[:n] = acceleration(model.A_inv, tau, model.h, g, c.viscous[:n].copy(), m.qd[:n].copy())
+    return _HOLD, tau
+
+
+@kernel
 def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
     n, noticed = f.q.shape[0], m.noticed != 0
@@ -226,9 +249,14 @@ def _act(
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin
     m.v_ref[:], m.w_ref[:], m.tau_obstacles[:n] = task[6:9], task[9:], torques[OBSTACLES]
-    command, tau_wanted = _limited(c, m, f, model, torques)
+    if holds_itself(c, m):
+        command, tau_wanted = _held(c, m, f, model, around)
+    else:
+        command, tau_wanted = _limited(c, m, f, model, torques)
     pursued = target_of(m, m.has_goal != 0 and m.state == _RUN)
     p = progress_of(pursued.task, pursued.axis, pursued.position, pursued.wxyz, x, R, xd, omega)
+    if m.parking != 0 and m.state == _RUN:
+        p = parking_progress(m, n)
     flags = progress_timers(c, m, pursued, p)
     shown = target_of(m, m.has_goal != 0)
     raw = pack(

@@ -18,6 +18,10 @@ from rtctl.world import obstacle_table
 CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
 CLEARING = "drive faults are being cleared now: reset again"
 OUTSIDE = "a joint is beyond its limits: move it back by hand, or use recover"
+FALLS = "the arm has no brakes and falls without torque: {} first, or disarm --drop lets it fall"
+NO_PARK = "the config has no robot.park_rad: where the arm rests without torque"
+PARK_TOLERANCE, PARKED = 0.03, 0.1  # [rad] where parking ends; within which the arm counts as parked
+HELD = (State.SAFE_STOP, State.STOPPING)
 INSIDE = "no joint is beyond its limits, there is nothing to recover from: use arm"
 LEVER = 0.05  # [m] of all joints together, below which a weight at the tip cannot be felt
 RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {})
@@ -25,16 +29,27 @@ RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, {})
 
 def supervise(robot: Robot, m: Memory, feedback: Feedback, request: Request, present: int) -> Memory:
     """Return the memory after the supervisor's table took this tick's events."""
-    if m.state == State.RUN and request.verb == Verb.NONE and faults.TABLE.stops(m.in_force) < Severity.SS2:
-        return m  # what RUN is left for is asked, or a fault
+    parking = m.parking and m.status == Status.MOVING
+    undisturbed = request.verb == Verb.NONE and faults.TABLE.stops(m.in_force) < Severity.SS2
+    if m.state == State.RUN and undisturbed and (parking or not m.parking):
+        return m  # what RUN is left for is asked, or a fault, or it is parked
     if request.verb in (Verb.FLOAT, Verb.HOLD):
         m, request = _guided(robot, m, request.verb), request._replace(verb=Verb.NONE)
     verb, before = request.verb, m.state
+    parks = robot.park is not None and m.state == State.RUN and not m.outside
+    if verb == Verb.TERM and robot.park_on_exit and parks and not m.leaving and not parked(robot, m):
+        return to_park(robot, m)._replace(leaving=True)
+    if verb == Verb.PARK and parks:
+        m, verb = to_park(robot, m), Verb.NONE
     clearing = verb == Verb.RESET and supervisor.admits(before, verb) and bool(present & BIT["drive_fault"])
     if verb == Verb.ARM and m.outside:
         refusal = OUTSIDE
     elif verb == Verb.RECOVER and not m.outside:
         refusal = INSIDE
+    elif verb == Verb.DISARM and robot.brakeless and not parked(robot, m):
+        refusal = FALLS.format("give robot.park_rad and park it" if robot.park is None else "park it")
+    elif verb == Verb.PARK:
+        refusal = NO_PARK if robot.park is None else OUTSIDE if m.outside else f"not possible in state {before.name}"
     else:
         refusal = ""
     asked = Asked(
@@ -44,13 +59,14 @@ def supervise(robot: Robot, m: Memory, feedback: Feedback, request: Request, pre
         _timed(robot, m, reductions.all_equal(feedback.drive, 1)),
         CLEARING if clearing else "",
         refusal,
+        robot.brakeless and not (m.off or m.outside or m.no_position) and reductions.all_equal(feedback.drive, 1),
     )
     step = supervisor_step(RULES, Session(before, m.since, m.reaction, m.in_force, m.leaving), asked)
     m = m._replace(**step.session._asdict(), refusal=step.refusal or m.refusal)
     if clearing:
         m = m._replace(clear_until=m.tick + round(CLEAR_TIME / robot.dt))
     if m.state != before:
-        m = _entered(robot, m)
+        m = _entered(robot, m, before, robot.brakeless and verb != Verb.DROP and not parked(robot, m))
     if step.event == Event.ARM:
         m = m._replace(recovering=m.outside)
     at_rest = m.state in (State.IDLE, State.FAULT) or (m.state == State.SAFE_STOP and m.off)
@@ -64,6 +80,12 @@ def _timed(robot: Robot, m: Memory, enabled: bool) -> frozenset[Event]:
         if enabled and elapsed >= SETTLE:
             return frozenset((Event.SETTLED,))
         return frozenset((Event.TIMEOUT,) if not enabled and elapsed >= ENABLE_TIMEOUT else ())
+    if m.state == State.RUN and m.parking and m.status != Status.MOVING:
+        if m.status == Status.ARRIVED:
+            return frozenset((Event.DISARM,))
+        return frozenset((Event.TERM,) if m.leaving else ())
+    if m.state == State.STOPPING and m.sinks:
+        return frozenset((Event.RESTED,) if m.off else ())
     if m.state == State.STOPPING:
         at_rest = m.rest * robot.dt >= REST_HOLD and elapsed >= REST_HOLD
         return frozenset((Event.RESTED,) if at_rest or not enabled or elapsed >= STOP_TIME else ())
@@ -89,9 +111,15 @@ def _guided(robot: Robot, m: Memory, verb: Verb) -> Memory:
     )
 
 
-def _entered(robot: Robot, m: Memory) -> Memory:
-    """Return the memory on entering a state: every motion begins from what is measured now."""
-    m = free_of_goals(m)._replace(off=False, onset=m.joints.qd, onset_faults=m.present)
+def _entered(robot: Robot, m: Memory, before: State, falls: bool) -> Memory:
+    """Return the memory on entering a state: every motion begins from what is measured now.
+
+    falls: without torque the arm would fall, and nobody has said that it may.
+    """
+    sinks = falls and m.state == State.STOPPING and (before != State.SAFE_STOP or not m.off)
+    m = free_of_goals(m)._replace(off=False, onset=m.joints.qd, onset_faults=m.present, sinks=sinks)
+    if not (before in HELD and m.state in HELD):
+        m = m._replace(own_phase=0, lost=0, no_position=0, no_speed=0)
     if m.state in (State.ARMED, State.RUN):
         m = m._replace(v_ref=np.zeros(3), w_ref=np.zeros(3))
     return held_here(robot, m)
@@ -105,6 +133,19 @@ def held_here(robot: Robot, m: Memory) -> Memory:
 def hold_at(x: F64, R: F64, axes: Task) -> Goal:
     """Return the goal of staying at x (3,) [m] with orientation R (3, 3), along the axes that the arm can move."""
     return Goal(x.copy(), quat_of(R), axes, 0.0, 0.0)
+
+
+def parked(robot: Robot, m: Memory) -> bool:
+    """Return whether the arm is where it rests without torque."""
+    return robot.park is not None and bool((np.abs(m.joints.q - robot.park) < PARKED).all())
+
+
+def to_park(robot: Robot, m: Memory) -> Memory:
+    """Return the memory with the goal of being parked: of the joints, the tip goes where they take it."""
+    x, R, nothing = m.tip.x.copy(), quat_of(m.tip.R), Task(0)
+    goal = Goal(x, R, nothing, 1.0, PARK_TOLERANCE, posture=robot.park)
+    rho = obstacle_table.distance_from(m.world, x)
+    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, parking=True, floating=False)
 
 
 def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
@@ -134,6 +175,7 @@ def free_of_goals(m: Memory) -> Memory:
     return m._replace(
         goal=None,
         status=Status.NO_GOAL,
+        parking=False,
         blocker=-1,
         blockers=0,
         blocked_by=(),

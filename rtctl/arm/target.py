@@ -29,8 +29,16 @@ SAME, DIAGNOSE, WORDS = 0, 4, 8  # nothing; a diagnosis; other words, for what b
 # numbers of the enumerations, as compiled code reads them
 _ARMED, _RUN, _STOPPING, _SAFE_STOP = (int(s) for s in (State.ARMED, State.RUN, State.STOPPING, State.SAFE_STOP))
 _NONE, _CHOOSING, _FIRST, _OTHER = (int(p) for p in (Phase.NONE, Phase.CHOOSING, Phase.FIRST, Phase.OTHER))
-_NO_GOAL, _MOVING, _ARRIVED, _ESCAPING, _FLOATING = (
-    int(s) for s in (Status.NO_GOAL, Status.MOVING, Status.ARRIVED, Status.ESCAPING, Status.FLOATING)
+_NO_GOAL, _MOVING, _ARRIVED, _LOCAL_MINIMUM, _ESCAPING, _FLOATING = (
+    int(s)
+    for s in (
+        Status.NO_GOAL,
+        Status.MOVING,
+        Status.ARRIVED,
+        Status.LOCAL_MINIMUM,
+        Status.ESCAPING,
+        Status.FLOATING,
+    )
 )
 
 
@@ -160,6 +168,7 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
 @kernel
 def _forget_goal(m: RecordRow) -> None:
     m.has_goal, m.goal_task, m.goal_tolerance, m.goal_tolerance_rot, m.has_posture = 0, 0, 0.0, 0.0, 0
+    m.parking = 0
     m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:] = 0.0, 0.0, 0.0, 0.0
     m.status, m.still, m.nearest, m.stall_timer = _NO_GOAL, 0, np.inf, 0.0
     m.blocker, m.blockers = -1, np.uint64(0)
@@ -187,6 +196,15 @@ def _waited(c: RecordRow, m: RecordRow) -> bool:
 
 
 @kernel
+def parking_progress(m: RecordRow, n: int) -> Progress:
+    """Return how far the joints are from where they are parked, the furthest as an angle [rad], and how fast."""
+    away = speed = 0.0
+    for i in range(n):
+        away, speed = max(away, abs(m.goal_posture[i] - m.q[i])), max(speed, abs(m.qd[i]))
+    return Progress(0.0, away, 0.0, speed)
+
+
+@kernel
 def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> int:
     """Advance the timers of the way to the goal; return DIAGNOSE when it is time to ask what holds the arm."""
     if m.has_goal == 0 or m.state != _RUN:
@@ -204,6 +222,9 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
     if _circulates(m) or m.escape_phase == _CHOOSING:
         m.status, m.still = _ESCAPING, 0  # held by what it circulates
         return SAME
+    if m.parking != 0:
+        m.still = m.still + 1 if at_rest(p) else 0
+        return _take_status(m, _LOCAL_MINIMUM if m.still * c.dt >= c.stop_stall else _MOVING)
     before = _waited(c, m)
     left = time_left(p, c.motion_v_max, c.motion_w_max)
     m.stall_timer = stall_timer(m.stall_timer, p, left, m.nearest, c.dt, c.stop_stall)

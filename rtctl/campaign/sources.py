@@ -16,7 +16,7 @@ from rtctl.errors import ConfigError
 from rtctl.plain import Json
 from rtctl.spec.scenario import load_scenario, scenario_dict
 
-ARMS = ("planar4", "puma560", "panda", "ur5", "openarm")
+ARMS = ("planar4", "puma560", "panda", "ur5", "openarm_e2e")
 
 
 def numbered(source: str, asked: Asked) -> Iterator[Case]:

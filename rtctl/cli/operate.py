@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 VERBS = {
     "arm": "enable the drives; the arm holds where it is",
     "disarm": "come to rest, then disable the drives",
+    "park": "move to robot.park_rad, where the arm rests without torque, then disable the drives",
     "stop": "brake now; only an operator's reset leaves the stop",
     "reset": "leave a latched stop or fault, once its cause is gone",
     "float": "let a hand move the arm: its weight is carried, limits and obstacles are kept; ends with hold or a goal",
@@ -51,6 +52,8 @@ def add(commands: Commands) -> None:
     for verb, text in VERBS.items():
         parser = command(commands, verb, text, f"rtctl {verb} --robot panda", _verb)
         _add_no_wait(parser)
+        if verb == "disarm":
+            parser.add_argument("--drop", action="store_true", help="also an arm without brakes, which falls then")
         parser.add_argument(
             "--timeout", metavar="S", type=positive, default=60.0, help="to come to that (%(default)s s)"
         )
@@ -157,10 +160,11 @@ def _verb(arguments: argparse.Namespace) -> int:
     from rtctl.cli.waiting import perform, ready_session, told
 
     verb = arguments.command
+    message: Json = {"verb": verb, "drop": True} if verb == "disarm" and arguments.drop else {"verb": verb}
     if arguments.no_wait:
-        return _said(_demand(arguments, {"verb": verb}), f"{verb}: accepted")
+        return _said(_demand(arguments, message), f"{verb}: accepted")
     with ready_session(arguments, verb, PATIENCE if verb in PATIENT else 0.0) as session:
-        return told(verb, perform(session, verb, arguments.timeout))
+        return told(verb, perform(session, message, arguments.timeout))
 
 
 def _payload(arguments: argparse.Namespace) -> int:

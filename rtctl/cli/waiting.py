@@ -24,6 +24,7 @@ AIMS = {
     "arm": "the robot is armed and holds",
     "recover": "the robot is armed and moves inward",
     "disarm": "it rests and the drives are off",
+    "park": "it is parked and the drives are off",
     "stop": "it rests",
     "float": "a hand may move the arm",
     "hold": "the arm holds itself",
@@ -86,12 +87,12 @@ def _doing(session: Session) -> str:
     return str(status.get("detail")) if status.get("state") == STARTING else ""
 
 
-def perform(session: Session, verb: str, timeout: float) -> End:
+def perform(session: Session, message: Json, timeout: float) -> End:
     """Tell a verb and wait until what it causes has happened. Raises RequestError for a refusal, LinkError."""
-    begun = time.monotonic()
+    begun, verb = time.monotonic(), str(message["verb"])
     while True:
         try:
-            accepted(session.ask({"verb": verb}))
+            accepted(session.ask(message))
             break
         except RequestError as error:  # the first reset has the drives clear their faults; a later one finds them gone
             if "being cleared" not in str(error) or time.monotonic() - begun > CLEARING_TIME:
@@ -141,7 +142,10 @@ def _end(verb: str, status: Json, since: float, idle: float) -> End | None:
             )
         left = ", ".join(map(str, status.get("faults") or ()))
         return End(True, "IDLE" + (f"; still there: {left}" if left else ""))
-    return None if state == "STOPPING" else End(False, state + _why(status, since))
+    if verb == "reset" and state == "RUN":
+        return End(True, "RUN: without brakes the arm goes on being held")
+    on_its_way = verb == "park" and state == "RUN" and status.get("status") in ("no_goal", "moving", "arrived")
+    return None if state == "STOPPING" or on_its_way else End(False, state + _why(status, since))
 
 
 def _why(status: Json, since: float) -> str:

@@ -26,12 +26,15 @@ class Event(IntEnum):
     TIMEOUT = 8  # the drives did not enable in time
     SETTLED = 9  # drives enabled and the hold torque has built up
     RESTED = 10  # at rest, held long enough
+    RESUME = 11  # a reset of what would fall without torque: it goes on being held
 
 
 EVENT_OF = {
     Verb.ARM: Event.ARM,
     Verb.RECOVER: Event.ARM,
     Verb.DISARM: Event.DISARM,
+    Verb.DROP: Event.DISARM,
+    Verb.PARK: Event.DISARM,  # at its end: an arm first moves
     Verb.STOP: Event.STOP,
     Verb.RESET: Event.RESET,
 }
@@ -65,6 +68,7 @@ TABLE: dict[tuple[State, Event], State] = {
     (S.SAFE_STOP, E.SS1): S.SAFE_STOP,  # while it lasts nothing but torque off leaves the damped stop
     (S.SAFE_STOP, E.TERM): S.STOPPING,
     (S.SAFE_STOP, E.RESET): S.STOPPING,
+    (S.SAFE_STOP, E.RESUME): S.RUN,
     (S.FAULT, E.RESET): S.IDLE,
     (S.FAULT, E.TERM): S.IDLE,
 }
@@ -105,6 +109,7 @@ class Asked(NamedTuple):
     timed: frozenset[Event]  # that come of waiting in this state
     refusal: str = ""  # of the vehicle's own, before those of the faults
     refusal_last: str = ""  # the same, where no fault refuses
+    falls: bool = False  # without torque it would fall, and has not been let go
 
 
 class Step(NamedTuple):
@@ -156,4 +161,4 @@ def _verb(rules: Rules, s: Session, asked: Asked) -> tuple[Session, set[Event], 
         refusal = asked.refusal or rules.table.reasons(refuses) or asked.refusal_last
     if refusal:
         return s, set(), f"{verb.name.lower()}: {refusal}"
-    return s, {EVENT_OF[verb]}, ""
+    return s, {Event.RESUME if verb == Verb.RESET and asked.falls else EVENT_OF[verb]}, ""

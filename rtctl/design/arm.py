@@ -18,11 +18,13 @@ from rtctl.arm.robot import Robot, StopParams
 from rtctl.arm.self_collision import Own, nothing
 from rtctl.design import points as psp
 from rtctl.design.assets import Assets, load_assets, placed
+from rtctl.design.description import notes
 from rtctl.design.filters import design, design_joint, tip_params
 from rtctl.design.mobility import mobility
 from rtctl.design.pairs import watched
 from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of
+from rtctl.protocol import mit
 from rtctl.spec import rules
 from rtctl.spec.goal import task_of
 from rtctl.spec.obstacles import Obstacle, quaternion, shape_of
@@ -36,6 +38,8 @@ POSTURES = 256  # sampled for torque and inertia extremes
 NOTICEABLE = 0.002  # of the rating: an external torque that is less is what rounding of torques leaves
 FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
 VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
+OWN_RATE = 150.0  # [1/s] of the drives' own position loops at most: they turn at 10 kHz or more, the virtual ones at 2
+OWN_DAMPING = 1.4  # of those loops, twice the damping ratio
 P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
 
 
@@ -46,6 +50,7 @@ class Extremes(NamedTuple):
     gravity_home: F64  # (n,) [Nm] |g_i|
     inertia: F64  # (n,) [kg m2] largest A_ii
     inertia_home: F64  # (n,) [kg m2] A_ii
+    inertia_free: F64  # (n,) [kg m2] least 1 / (A^-1)_ii: of a joint while the others are free
     tool: F64  # (n,) [Nm] largest torque of the tool's weight
     payload: F64  # (n,) [Nm] largest |g_i| with payload_max_kg at the tip
     payload_home: F64  # (n,) [Nm] the same at home
@@ -58,6 +63,7 @@ def build(config: Config, path: str | Path) -> Robot:
     """
     source, joints = str(path), config.robot.joints
     body = rigid_body(config, Path(path))
+    _refuse_inertia(config, Path(path))
     _refuse_limits(config, body, source)
     home = np.array(config.robot.home_rad)
     found = extremes(config, body)
@@ -115,6 +121,9 @@ def build(config: Config, path: str | Path) -> Robot:
         safety=_safety(config, tau_rated),
         stop=StopParams(
             damping=config.safety.stop_damping * found.inertia_home,
+            decay=config.safety.stop_damping,
+            kp=np.minimum(mit.KP_MAX, OWN_RATE**2 * found.inertia_free),
+            kd=np.minimum(mit.KD_MAX, OWN_DAMPING * OWN_RATE * found.inertia_free),
             time=config.safety.stop_s,
             frames=config.safety.stop_frames,
             stall=config.safety.stall_s,
@@ -122,6 +131,10 @@ def build(config: Config, path: str | Path) -> Robot:
         scratch=field_buffers(config.avoid.obstacles_max, len(points.link), len(joints)),
         tolerance=config.motion.tolerance_m,
         tolerance_rot=config.motion.tolerance_rad,
+        park=None if config.robot.park_rad is None else np.array(config.robot.park_rad),
+        park_on_exit=config.robot.park_on_exit,
+        urdf=str(urdf_file(config.robot.urdf, Path(path))),
+        brakeless=not all(rules.brakes(config)),
         axes=task_of(config.motion.axes),
     )
     return prepared(robot)
@@ -136,10 +149,12 @@ def extremes(config: Config, body: RigidBody) -> Extremes:
     models = [body.evaluate(q, still, points) for q in (np.array(config.robot.home_rad), *samples)]
     g = np.abs([m.g for m in models])
     A = np.array([np.diag(m.A) for m in models])
+    free = 1.0 / np.array([np.diag(m.A_inv) for m in models])
     tool, payload = tool_of(config), config.robot.payload_max_kg
     tools = np.array([weight(m, tool.mass, tool.com) for m in models])
     loaded = np.array([np.abs(m.g + weight(m, payload, np.zeros(3))) for m in models])
-    return Extremes(g.max(axis=0), g[0], A.max(axis=0), A[0], np.abs(tools).max(axis=0), loaded.max(axis=0), loaded[0])
+    most = g.max(axis=0), g[0], A.max(axis=0), A[0], free.min(axis=0)
+    return Extremes(*most, np.abs(tools).max(axis=0), loaded.max(axis=0), loaded[0])
 
 
 def weight(model: Model, mass: float, com: F64) -> F64:
@@ -176,6 +191,15 @@ def rigid_body(config: Config, path: Path) -> RigidBody:
         else:
             key = "robot.tip_frame" if what == "tip_frame" else "robot.urdf"
         raise ConfigError(name_place(str(path), key), error.got, f"{error.wanted} ({urdf.name})") from None
+
+
+def _refuse_inertia(config: Config, path: Path) -> None:
+    """Refuse an inertia tensor that no body has where neither we nor a simulator can make anything of it."""
+    urdf = urdf_file(config.robot.urdf, path)
+    for note in notes(urdf, [j.name for j in config.robot.joints]):
+        if note.refused:
+            wanted = f"inertia tensors that bodies have; {note.text} ({urdf.name})"
+            raise ConfigError(name_place(str(path), "robot.urdf"), f"link {note.about}", wanted)
 
 
 def _refuse_limits(config: Config, body: RigidBody, source: str) -> None:

@@ -1,5 +1,6 @@
 """What `rtctl check` tells of a robot: figures derived from its config, each with a verdict."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from rtctl.arm.robot import Robot
 from rtctl.control.firas import FieldParams
 from rtctl.design.arm import Extremes, extremes
+from rtctl.design.description import dynamics, notes
 from rtctl.plain import Json
 from rtctl.spec import rules
 from rtctl.spec.bus import LOAD_MAX
@@ -14,6 +16,8 @@ from rtctl.spec.robot import Config
 from rtctl.types import F64
 
 OK, WARN = "ok", "warn"
+SLOW = 0.3  # [rad/s] at which a joint without brake may sink
+SAG = 0.2  # [rad] of a joint that only its drive's kp holds, beyond which that is worth a warning
 
 
 class Row(NamedTuple):
@@ -58,7 +62,8 @@ def report(config: Config, robot: Robot) -> Report:
     found = extremes(config, robot.body)
     rows = [*_bus(config), *_loop(config, robot), *_motion(config, robot)]
     rows += _field("obstacle", robot.avoid, robot) + _field("self", robot.self_avoid, robot)
-    rows += [*_limits(robot, found), *_torque(robot, found), *_points(config, robot)]
+    rows += [*_limits(robot, found), *_torque(robot, found), *_unbraked(config, robot, found), *_points(config, robot)]
+    rows += [*_resolution(robot), *_description(robot)]
     return Report(robot.name, tuple(rows))
 
 
@@ -167,6 +172,44 @@ def _torque(r: Robot, found: Extremes) -> list[Row]:
         i = int(ratio.argmax())
         note = f"{found.payload[i]:.3g} of {r.tau_max[i]:.4g} Nm at {r.joints[i]}, {r.payload_max:g} kg at the tip"
         rows.append(_row("gravity with payload_max_kg", 100 * ratio[i], "%", note, bool(ratio[i] < 1.0)))
+    return rows
+
+
+def _unbraked(c: Config, r: Robot, found: Extremes) -> list[Row]:
+    """What the drives' own loops can do for joints without a brake when the controller stops."""
+    rows = []
+    for i, (joint, brake) in enumerate(zip(r.joints, rules.brakes(c), strict=True)):
+        if brake:
+            continue
+        g, kp, kd = found.gravity[i], r.stop.kp[i], r.stop.kd[i]
+        note = (
+            f"no brake: by its drive's kp {kp:.3g} Nm/rad within {g / kp:.2g} rad of {g:.3g} Nm; "
+            f"kd {kd:.2g} Nms/rad alone carries {SLOW * kd:.2g} Nm at {SLOW:g} rad/s, and sinks at {g / kd:.2g} rad/s"
+        )
+        rows.append(_row(f"held at {joint}", g / kp, "rad", note, bool(g / kp < SAG)))
+    if rows:
+        parked = c.robot.park_rad is not None
+        note = "robot.park_rad: disarm there" if parked else "no robot.park_rad: nowhere to disarm but with --drop"
+        rows.append(_row("place to park", int(parked), "", note, parked))
+    return rows
+
+
+def _resolution(r: Robot) -> list[Row]:
+    """Is one step of a drive's torque lost in what the estimator takes for noise of the acceleration?"""
+    inertia = r.stop.damping / r.stop.decay  # A_ii at home
+    step = r.tau_lsb / np.sqrt(12.0) / inertia / r.joint_filter.sigma_qdd
+    i = int(step.argmax())
+    note = f"worst: {r.joints[i]}: a step of {r.tau_lsb[i]:.2g} Nm, over estimator.joint_acceleration_rad_s2"
+    return [_row("torque resolution", step[i], "x", note, bool(step[i] <= 1.0))]
+
+
+def _description(r: Robot) -> list[Row]:
+    """What the URDF says that no body has, or that is not used."""
+    rows = [_row(f"inertia of {note.about}", 0, "", note.text, False) for note in notes(Path(r.urdf), r.joints)]
+    if found := dynamics(Path(r.urdf), r.joints):
+        damping, friction = (max(values[k] for values in found.values()) for k in (0, 1))
+        note = f"Nms/rad of damping and {friction:g} Nm of friction are not used of the URDF; friction_Nms_rad is"
+        rows.append(_row("URDF dynamics", damping, "", note))
     return rows
 
 

@@ -68,6 +68,12 @@ class Arm(_Message, tag="arm", frozen=True):
 class Disarm(_Message, tag="disarm", frozen=True):
     """Come to rest, then disable the drives."""
 
+    drop: bool = False  # also an arm that falls then
+
+
+class Park(_Message, tag="park", frozen=True):
+    """Move to where the arm rests without torque, then disable the drives."""
+
 
 class Stop(_Message, tag="stop", frozen=True):
     """Brake now and stay stopped."""
@@ -166,6 +172,7 @@ class CloudFrame(NamedTuple):
 Message = (
     Arm
     | Disarm
+    | Park
     | Stop
     | Reset
     | Recover
@@ -181,6 +188,7 @@ Message = (
 VERBS = {
     Arm: Verb.ARM,
     Disarm: Verb.DISARM,
+    Park: Verb.PARK,
     Stop: Verb.STOP,
     Reset: Verb.RESET,
     Recover: Verb.RECOVER,
@@ -296,6 +304,8 @@ def request_of(
             return Request(payload=Payload(message.mass_kg, *message.com_m))
         case Status() | World():
             return Request()
+        case Disarm(drop=True):
+            return Request(verb=Verb.DROP)
         case _:
             return Request(verb=VERBS[type(message)])
 

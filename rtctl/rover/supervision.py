@@ -22,9 +22,12 @@ STOP_TIME = 6.0  # [s] after which a stop is believed over: no feedback says so
 HOLD_TIME = 3.0  # [s] for the autopilot to take its hold mode
 DISARM_TIME = 3.0  # [s] for it to disarm
 NO_EFFECT = 2.0  # [s] of little done; three times that where the autopilot turns before it drives
+NOT_ARM = "a base has no joints, wanted disarm"
 WITHOUT = {
     Verb.RECOVER: "a base has no joint limits",
     Verb.FLOAT: "a base is not moved by hand",
+    Verb.PARK: NOT_ARM,
+    Verb.DROP: NOT_ARM,
     Verb.HOLD: "a base has no such verb yet: use stop",
 }
 RULES = Rules(faults.TABLE, faults.REFUSES_ARMING, WITHOUT)

@@ -46,7 +46,13 @@ class PlantTable(Table, frozen=True, kw_only=True):
     static_Nm: Annotated[Torque | Torques, Meta(description="friction of one that sticks; at least coulomb_Nm")] = 0.0
     viscous_Nms_rad: Annotated[Torque | Torques, Meta(description="beside the robot file's")] = 0.0
     torque_gain: Annotated[Gain | Gains, Meta(description="what the joint gets, of what the drive says it gives")] = 1.0
-    brake: Annotated[Brake | Brakes, Meta(description="a number: the Nm at which it slips")] = "ideal"
+    brake: (
+        Annotated[
+            Brake | Brakes,
+            Meta(description="the Nm at which it slips; default: ideal where the file has any"),
+        ]
+        | None
+    ) = None
     encoder_zero_rad: (
         Annotated[Zero | Zeros, Meta(description="a drive reads direction * q + zero; default: as the robot file says")]
         | None

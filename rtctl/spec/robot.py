@@ -48,6 +48,7 @@ class Joint(Table, frozen=True, kw_only=True):
     friction_Nms_rad: Annotated[float, Meta(ge=0.0, le=1000.0, description="viscous, seen at the joint, B G^2")] = 0.0
     friction: Annotated[FrictionTable, Meta(description="given beforehand")] = FrictionTable()
     reply_id: Annotated[int, Meta(ge=1, le=0x7FE, description="of its replies; default: can_id + 0x10")] | None = None
+    brake: Annotated[bool, Meta(description="has a holding brake; default: as its drive's type")] | None = None
     direction: Annotated[Literal[1, -1], Meta(description="-1: the drive counts the other way round")] = 1
     zero_rad: Annotated[Angle, Meta(description="the drive reads direction q + zero_rad")] = 0.0
     wrap: Annotated[
@@ -90,6 +91,8 @@ class RobotTable(Table, frozen=True, kw_only=True):
     tip_frame: Annotated[Key, Meta(description="frame of the URDF that the goals are for")]
     home_rad: Annotated[Angles, Meta(description="rest posture: default start and null-space attractor")]
     joints: Annotated[tuple[Joint, ...], Meta(min_length=1, max_length=15)]
+    park_rad: Annotated[Angles, Meta(description="where the arm rests without torque, for park")] | None = None
+    park_on_exit: Annotated[bool, Meta(description="SIGTERM parks an arm; else one without brakes is lowered")] = False
     base_pose: BasePose = BasePose()
     payload_max_kg: Annotated[
         float, Meta(ge=0.0, le=200.0, description="largest payload at the tip, carried without being told")
@@ -266,6 +269,8 @@ class DriveTable(Table, frozen=True, kw_only=True):
     p_max_rad: Annotated[float, Meta(ge=0.1, le=32.0)]
     v_max_rad_s: Annotated[float, Meta(ge=0.1, le=120.0)]
     t_max_Nm: Annotated[float, Meta(ge=0.01, le=5000.0)]
+    # as every drive of a file was taken to be before there was this key: their logs replay as they were
+    brake: Annotated[bool, Meta(description="such drives come with a holding brake")] = True
 
 
 class MeshTable(Table, frozen=True, kw_only=True):

@@ -53,6 +53,12 @@ def scales(config: Config) -> tuple[Scale, ...]:
     return tuple(scale for scale in found if scale is not None)
 
 
+def brakes(config: Config) -> tuple[bool, ...]:
+    """Return which joints have a holding brake: as the joint says, else as its drive's type; the catalogue's: none."""
+    own = config.drives
+    return tuple((j.drive in own and own[j.drive].brake) if j.brake is None else j.brake for j in config.robot.joints)
+
+
 def bus_load(config: Config) -> Load:
     """Return the load of the configured bus at worst-case stuffing."""
     payload = e2e.LENGTH if config.link.protocol == "mit+e2e" else mit.LENGTH
@@ -187,6 +193,8 @@ def _postures(c: Config) -> Iterator[Found]:
     postures: list[tuple[str, Sequence[float]]] = [("robot.home_rad", c.robot.home_rad)]
     if c.motion.posture.q_rest_rad is not None:
         postures.append(("motion.posture.q_rest_rad", c.motion.posture.q_rest_rad))
+    if c.robot.park_rad is not None:
+        postures.append(("robot.park_rad", c.robot.park_rad))
     for joint in joints:
         if joint.q_max_rad - joint.q_min_rad <= 2.0 * zone:
             span = joint.q_max_rad - joint.q_min_rad
@@ -201,7 +209,14 @@ def _postures(c: Config) -> Iterator[Found]:
                 yield Found(f"{path}[{i}]", q[i], f"within the limits {low:g} to {high:g} of {joint.name}")
             if not low + zone <= q[i] <= high - zone:
                 # a rest posture inside a limit zone pulls against the potential: the tip stays short for ever
-                yield Found(f"{path}[{i}]", q[i], f"outside the limit zone: {low + zone:.4g} to {high - zone:.4g}")
+                free = ", ".join(f"{_nearest(j, x, zone):.4g}" for j, x in zip(joints, q, strict=True))
+                wanted = f"outside the limit zone: {low + zone:.4g} to {high - zone:.4g}; the nearest is [{free}]"
+                yield Found(f"{path}[{i}]", q[i], wanted)
+
+
+def _nearest(joint: Joint, q: float, zone: float) -> float:
+    """Return the angle [rad] next to q that is in no limit zone."""
+    return min(max(q, joint.q_min_rad + zone), joint.q_max_rad - zone)
 
 
 def _link(c: Config) -> Iterator[Found]:

@@ -181,7 +181,7 @@ def take_file(data: bytes) -> None:
 
 
 def _files() -> list[bytes]:
-    names = ("planar4.toml", "rover.toml", "scenarios/openarm.toml")
+    names = ("planar4.toml", "rover.toml", "scenarios/openarm_e2e.toml")
     return [(ROOT / "configs" / name).read_bytes() for name in names]
 
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.protocol import batch, e2e, frame, mit
-from rtctl.protocol.mounting import STRAIGHT, Mounting, Wiring, fields_of, joint_reply
-from rtctl.types import F64, I64, Command, Drive, Feedback, Frames, Link, Transport
+from rtctl.protocol.mounting import STRAIGHT, Mounting, Wiring, drive_angle, fields_of, joint_reply
+from rtctl.types import F64, I64, Command, Drive, Feedback, Frames, Hold, Link, Transport
 
 MIT, MIT_E2E = "mit", "mit+e2e"
 _SPECIAL = {Drive.DISABLE: mit.DISABLE, Drive.ENABLE: mit.ENABLE, Drive.CLEAR: mit.CLEAR}
@@ -102,6 +102,7 @@ class CanLink:
         joints, self.turns = self.spec.joints, turns
         mountings = [joint.mounting._replace(turns=k) for joint, k in zip(joints, turns, strict=True)]
         drives = [Wiring(j.can_id, j.reply_id, j.scale, m) for j, m in zip(joints, mountings, strict=True)]
+        self._mountings = mountings
         self._fields = [fields_of(drive.scale, drive.mounting) for drive in drives]
         self._cycle = batch.cycle_of(self.protected, self.spec.fd, drives)
 
@@ -128,11 +129,26 @@ class CanLink:
 
     def write(self, command: Command) -> Sequence[bytes]:
         """Send one frame to each joint, or drop it; return the raw frames that went out."""
+        if command.hold is not None:
+            return self.transport.send_all(Frames(self._held(command.tau, command.hold), self._size))
         special = _SPECIAL.get(command.drive)
         if special is None:
             return self.transport.send_all(batch.encode(self._cycle, command.tau, self._counters))
         frames = b"".join([self.encode(j, special) for j in range(len(self.spec.joints))])
         return self.transport.send_all(Frames(frames, self._size))
+
+    def _held(self, tau: F64, hold: Hold) -> bytes:
+        """Return a frame for each joint that has its drive hold it by its own loop, or a disable frame."""
+        frames = []
+        for j, joint in enumerate(self.spec.joints):
+            if hold.off[j]:
+                frames.append(self.encode(j, mit.DISABLE))
+                continue
+            mounting, d = self._mountings[j], self._mountings[j].direction
+            p = drive_angle(float(hold.p[j]), mounting)
+            rest = d * float(hold.v[j]), float(hold.kp[j]), float(hold.kd[j]), d * float(tau[j])
+            frames.append(self.encode(j, mit.encode_command(p, *rest, joint.scale), e2e.Wanted.TORQUE))
+        return b"".join(frames)
 
     # ---- in
 

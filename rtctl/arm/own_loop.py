@@ -1,0 +1,202 @@
+"""Stops of an arm without brakes: each drive holds its joint by its own loop, and then lowers it.
+
+    tau_i = kp (p - q) + kd (v - qd) + t        in the drive, on its own encoder, with no bus in it
+
+p, v come to rest from where the joint was, t carries gravity (and damps, where the joint's speed is known). A joint
+whose encoder lies gets no term of it: one whose position alone lies is damped, one of which nothing is true is let go,
+as is one whose drive has tripped. The others go on holding: they keep the rest from following.
+
+When all rest, the arm is lowered down the slope of its potential energy, qd ~ -g(q), until gravity moves it no more,
+it lies on something, or its limits carry it; then kp and t fade, and torque is cut. m, c: as in `sensing`.
+"""
+
+import math
+
+import numpy as np
+
+from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, STUCK_TIME, STUCK_TRAVEL, TRAVEL
+from rtctl.arm.faults import BIT
+from rtctl.arm.model import Model
+from rtctl.arm.sensing import Surroundings
+from rtctl.kernel import kernel
+from rtctl.types import F64, Feedback, RecordRow, Severity, State
+
+BRAKING, LOWERING, SINKING = 1, 2, 3  # phases; 0: the drives' loops are not used
+HOLD_TIME = 1.0  # [s] in which the joints come to rest and are held before they are lowered
+JOINT_SPEED, TIP_SPEED, LINK_SPEED = 0.2, 0.10, 0.12  # [rad/s], [m/s] of the tip, of any point, while it is lowered
+GATHER = 0.4  # [s] to that speed
+FLAT = 0.01  # of a joint's rating: gravity below it moves nothing worth lowering
+PRESS = 0.1  # of a joint's rating, with which an arm that is lowered lies on what is in its way
+LOWERED = 60.0  # [s] after which lowering ends, whatever is left
+RESTS = 0.5  # [s] for which all joints must rest before torque is cut
+AT_LIMIT = 0.01  # [rad] from a joint's limit, where it is lowered no further
+SINK_RATE, SINK_TIME, SINK_LATEST = 1.0, 4.0, 12.0  # [1/s], [s] with which kp and t fade at the end, until all rest
+NOTICE = 0.1  # [s] after the onset of a stop, in which a joint that was let go has not come to its end
+JUMP = 0.1  # [rad] between two readings: the position is untrue, the speed need not be
+
+# numbers of the enumerations, as compiled code reads them
+_STOPPING, _SAFE_STOP = int(State.STOPPING), int(State.SAFE_STOP)
+_SS1, _CONTACT = int(Severity.SS1), BIT["contact"]
+
+
+@kernel
+def holds_itself(c: RecordRow, m: RecordRow) -> bool:
+    """Return whether this stop is one of the drives' own loops: of an arm that without brakes would fall."""
+    if c.brakeless == 0.0:
+        return False
+    if m.state == _SAFE_STOP:
+        return bool(m.reaction >= _SS1 and m.off == 0)
+    return bool(m.state == _STOPPING and m.sinks != 0 and m.off == 0)
+
+
+@kernel
+def _distrust(c: RecordRow, m: RecordRow, f: Feedback) -> None:
+    """Note of which joints the encoder's position or speed is untrue, as long as the stop lasts; f: as it came.
+
+    A joint that falls shakes the others when it comes to its end: what they do then says nothing of their encoders.
+    """
+    n, monitors = f.q.shape[0], m.encoder_monitors
+    if m.lost != 0 and m.tick - m.own_since > NOTICE / c.dt:
+        return
+    for i in range(n):
+        bit = 1 << i
+        stuck = monitors[EQUAL, i] >= STUCK_TIME and abs(monitors[TRAVEL, i]) > STUCK_TRAVEL
+        if stuck or monitors[BEYOND, i] >= DISAGREE_TICKS:
+            m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
+        if f.replies[i] > 0 and not (math.isfinite(f.q[i]) and math.isfinite(f.qd[i])):
+            m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
+        elif f.replies[i] > 0 and abs(f.q[i] - m.q_previous[i]) > JUMP:  # see `sensing.plausible_feedback`
+            m.no_position = m.no_position | bit
+
+
+@kernel
+def _begin(c: RecordRow, m: RecordRow, n: int) -> None:
+    m.own_phase, m.own_since = BRAKING, m.tick
+    m.own_p[:n], m.own_v[:n], m.own_t[:n] = m.q[:n], m.qd[:n], m.sent[0, :n]
+    m.own_kp[:n], m.own_kd[:n] = c.stop_kp[:n], c.stop_kd[:n]
+    m.lost = 0
+    for i in range(n):
+        m.own_p[i] = min(max(m.own_p[i], c.q_min[i]), c.q_max[i])
+
+
+@kernel
+def _slope(c: RecordRow, m: RecordRow, model: Model, g: F64) -> F64:
+    """Return the speeds (n,) [rad/s] that lower the arm, zero where nothing does; g (n,) [Nm] gravity."""
+    n, most = g.shape[0], 0.0
+    u = np.zeros(n)
+    for i in range(n):
+        tau, held = c.tau_max[i], not m.lost >> i & 1
+        low, high = m.own_p[i] <= c.q_min[i] + AT_LIMIT, m.own_p[i] >= c.q_max[i] - AT_LIMIT
+        lies = m.own_kp[i] * (m.q[i] - m.own_p[i]) * (1.0 if g[i] > 0.0 else -1.0) > PRESS * tau  # on something
+        if held and abs(g[i]) > FLAT * tau and not (lies or (low and g[i] > 0.0) or (high and g[i] < 0.0)):
+            u[i] = -g[i]
+            most = max(most, abs(g[i]) / JOINT_SPEED)
+    if most == 0.0:
+        return u
+    u /= most
+    fastest = 0.0
+    for k in range(3):
+        s = 0.0
+        for i in range(n):
+            s += model.J[k, i] * u[i]
+        fastest += s * s
+    share = min(1.0, TIP_SPEED / max(math.sqrt(fastest), 1e-9))
+    for a in range(model.Jp.shape[0]):
+        fastest = 0.0
+        for k in range(3):
+            s = 0.0
+            for i in range(n):
+                s += model.Jp[a, k, i] * u[i]
+            fastest += s * s
+        share = min(share, LINK_SPEED / max(math.sqrt(fastest), 1e-9))
+    u *= share
+    return u
+
+
+@kernel
+def _obstructed(c: RecordRow, m: RecordRow, around: Surroundings, u: F64) -> bool:
+    """Return whether something that is known lies under the arm: lowered at u (n,) [rad/s] it comes no further."""
+    if m.present & _CONTACT:
+        return True
+    power, near = 0.0, np.inf
+    for k in range(around.rho.shape[0]):
+        near = min(near, around.rho[k])
+    for i in range(u.shape[0]):
+        power += m.tau_obstacles[i] * u[i]
+    return bool(near < 2.0 * c.avoid_rho_min and power < 0.0)
+
+
+@kernel
+def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F64) -> None:
+    """Move p, v of the joints on by a tick, and take the next phase when its time has come."""
+    n, since = g.shape[0], (m.tick - m.own_since) * c.dt
+    u = np.zeros(n)
+    if m.own_phase == LOWERING:
+        u = _slope(c, m, model, g)
+        moves = False
+        for i in range(n):
+            moves = moves or u[i] != 0.0
+        if moves and _obstructed(c, m, around, u):
+            u[:], since = 0.0, 0.0  # it is held there
+        elif not moves or since > LOWERED:
+            m.own_phase, m.own_since, since = SINKING, m.tick, 0.0
+    elif m.own_phase == BRAKING and since >= HOLD_TIME:
+        m.own_phase, m.own_since, since = LOWERING, m.tick, 0.0
+    for i in range(n):
+        rate = JOINT_SPEED / GATHER
+        if m.own_phase == BRAKING:
+            rate = min(c.stop_decay * abs(m.own_v[i]), c.braking[i])
+        m.own_v[i] += min(max(u[i] - m.own_v[i], -rate * c.dt), rate * c.dt)
+        p = m.own_p[i] + m.own_v[i] * c.dt
+        m.own_p[i] = min(max(p, c.q_min[i]), c.q_max[i])
+        if m.own_p[i] != p:
+            m.own_v[i] = 0.0
+    if m.own_phase == SINKING:
+        fade = math.exp(-SINK_RATE * c.dt)
+        for i in range(n):
+            m.own_kp[i], m.own_g[i] = fade * m.own_kp[i], fade * m.own_g[i]
+        if since >= SINK_LATEST or (since >= SINK_TIME and m.rest * c.dt >= RESTS):
+            m.off = 1
+
+
+@kernel
+def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, g: F64) -> None:
+    """Write what each drive is asked for in this tick, into own_p, own_v, own_kp, own_kd, own_t and the bits of lost.
+
+    f: as it came; g (n,) [Nm]: what carries the arm, by the best that is known of its posture.
+    """
+    n = g.shape[0]
+    if m.own_phase == 0:
+        _begin(c, m, n)
+    _distrust(c, m, f)
+    if m.own_phase != SINKING:
+        m.own_g[:n] = g
+    _go_on(c, m, model, around, g)
+    for i in range(n):
+        bit, step = 1 << i, c.tau_rate[i] * c.dt
+        heard = f.age[i] <= c.safety_lost_periods * c.dt
+        speed_true, position_true = not m.no_speed >> i & 1, not m.no_position >> i & 1
+        if f.drive[i] != 1 or not speed_true:
+            m.lost = m.lost | bit
+        t = m.own_g[i]
+        if m.lost & bit:
+            t, m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0, 0.0
+        elif not position_true:
+            m.own_kp[i], m.own_v[i] = 0.0, 0.0
+        elif heard and f.replies[i] > 0:
+            t -= c.stop_damping[i] * (m.qd[i] - m.own_v[i])
+        if not math.isfinite(t):
+            t = 0.0
+        t = min(max(t, -c.tau_max[i]), c.tau_max[i])
+        m.own_t[i] += min(max(t - m.own_t[i], -step), step)
+
+
+@kernel
+def given(c: RecordRow, m: RecordRow, n: int) -> F64:
+    """Return the torque (n,) [Nm] that the drives give by their own loops, as far as the state of the joints tells."""
+    tau = np.zeros(n)
+    for i in range(n):
+        if not m.lost >> i & 1:
+            t = m.own_kp[i] * (m.own_p[i] - m.q[i]) + m.own_kd[i] * (m.own_v[i] - m.qd[i]) + m.own_t[i]
+            tau[i] = min(max(t, -c.tau_max[i]), c.tau_max[i])
+    return tau
