@@ -180,6 +180,14 @@ class Payload(NamedTuple):
     z: float = 0.0
 
 
+class Grip(NamedTuple):
+    """What a gripper shall do."""
+
+    closed: float  # 0 open, 1 closed
+    force: float = 0.0  # [N] at most, 0: the gripper's own bound
+    name: str = ""  # of the gripper, '' every one
+
+
 class Request(NamedTuple):
     """Everything that reaches the tick from operators and sensors in one slot."""
 
@@ -187,6 +195,10 @@ class Request(NamedTuple):
     goal: Goal | None = None
     obstacles: tuple[ObstacleEdit, ...] = ()
     payload: Payload | None = None
+    grip: Grip | None = None
+
+
+NO_GRIPPERS = np.zeros((5, 0))
 
 
 class Feedback(NamedTuple):
@@ -203,6 +215,7 @@ class Feedback(NamedTuple):
     link: int  # Link flags of the cycle
     lateness: float  # [s] of the previous wake-up; logged, never used by the law
     compute: float  # [s] of the previous tick; logged, never used by the law
+    grippers: F64 = NO_GRIPPERS  # (5, g) q [rad], qd [rad/s], tau [Nm], age [s], drive status code of each
 
 
 class Hold(NamedTuple):
@@ -221,6 +234,7 @@ class Command(NamedTuple):
     drive: Drive
     tau: F64  # (n,) [Nm]
     hold: Hold | None = None  # of Drive.HOLD
+    grippers: F64 = NO_GRIPPERS  # (5, g) p [rad], v [rad/s], kp [Nm/rad], kd [Nms/rad], t [Nm] of their drives' loops
 
 
 class Frames(Sequence[bytes]):

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import can
 import numpy as np
 import pytest
+from damiao_motor import DaMiaoController, DaMiaoMotor
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,8 +19,6 @@ from firmware_sim.simulator import Simulator, open_simulator
 from rtctl.protocol import frame, mit
 from rtctl.types import Request, State, Verb
 from tests.lab import ROOT, Lab
-
-damiao_motor = pytest.importorskip("damiao_motor")
 
 pytestmark = pytest.mark.filterwarnings("ignore:The 'bustype' argument:DeprecationWarning")  # theirs
 OPENARM = ROOT / "configs" / "openarm.toml"  # as its maker ships it: plain frames of 8 bytes
@@ -53,13 +52,14 @@ class Wire(can.BusABC):
         return self.waiting.popleft() if self.waiting else None
 
 
-class Driver(damiao_motor.DaMiaoController):
+class Driver(DaMiaoController):  # type: ignore[misc]
     """The published controller on a wire; it reads by itself in a thread of its own."""
 
     def __init__(self, wire: Wire) -> None:
         super().__init__(channel="wire", bustype="virtual")
-        self.bus.shutdown()
-        self.bus = wire
+        opened: can.BusABC = self.bus
+        opened.shutdown()
+        self.bus: can.BusABC = wire
 
 
 @contextmanager
@@ -74,9 +74,9 @@ def driven(simulator: Simulator | None = None) -> Iterator[tuple[Driver, Wire]]:
         wire.shutdown()
 
 
-def motor(name: str) -> damiao_motor.DaMiaoMotor:
+def motor(name: str) -> DaMiaoMotor:
     """Return their motor of a type, on no bus."""
-    return damiao_motor.DaMiaoMotor(1, 0x11, None, motor_type=THEIRS[name])
+    return DaMiaoMotor(1, 0x11, None, motor_type=THEIRS[name])
 
 
 # ---- bytes
@@ -117,7 +117,7 @@ def test_they_read_a_reply_of_our_drive_as_we_do(name: str, share, err: int, hot
 
 
 def test_the_special_frames_are_theirs():
-    theirs = damiao_motor.DaMiaoMotor
+    theirs = DaMiaoMotor
     assert theirs.encode_enable_msg() == mit.ENABLE
     assert theirs.encode_disable_msg() == mit.DISABLE
     assert theirs.encode_save_position_zero_msg() == mit.ZERO

@@ -17,7 +17,21 @@ from rtctl.errors import ConfigError, PlanError
 from rtctl.kernel.rotations import R_of, quat_of
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, goal_of
-from rtctl.types import F64, Command, Drive, Feedback, Goal, ObstacleEdit, Request, Shape, Simulator, State, Truth, Verb
+from rtctl.types import (
+    F64,
+    Command,
+    Drive,
+    Feedback,
+    Goal,
+    Grip,
+    ObstacleEdit,
+    Request,
+    Shape,
+    Simulator,
+    State,
+    Truth,
+    Verb,
+)
 from rtctl.world import obstacle_table
 from rtctl.world.obstacle_table import World
 
@@ -89,6 +103,7 @@ class ArmFeed:
     def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: ArmTally) -> None:
         self.robot, self.simulator, self.tally = robot, simulator, tally
         self.pending = list(scenario.goal)
+        self.grips = sorted(scenario.grip, key=lambda g: g.at_s)
         self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its refusal not yet seen
         self.last: dict[str, Shape | None] = {}
         self.frames = 0
@@ -116,7 +131,14 @@ class ArmFeed:
                 goal = self._first(goal, m, truth)
         elif self.stream is not None and m.state == State.RUN:
             goal = self._next(self.stream, m, truth)
-        return Request(verb, goal, self._seen(truth))
+        return Request(verb, goal, self._seen(truth), grip=self._grip(m, truth))
+
+    def _grip(self, m: Memory, truth: Truth) -> Grip | None:
+        """Return what grippers are asked now; what is due before the arm runs waits."""
+        if not self.grips or m.state != State.RUN or truth.time < self.grips[0].at_s:
+            return None
+        asked = self.grips.pop(0)
+        return Grip(asked.closed, asked.force_N)
 
     def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
         """Return the first sub-goal on the way to `goal`, or that itself where there is no plan."""

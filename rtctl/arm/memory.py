@@ -143,7 +143,7 @@ HOT = np.dtype(
     )
 )
 _NAMES = frozenset(HOT.names or ())
-_COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes")
+_COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes", "grippers")
 _JOINTS = (
     "onset",
     "own_p",
@@ -196,6 +196,7 @@ class Memory(msgspec.Struct, frozen=True):
     placed: World  # the obstacles when they were last edited
     table: F64  # where they are now, and how far from arm and goal; see `flat`
     shapes: F64  # what does not change of them between edits
+    grippers: F64  # (4, g) what its grippers remember; see `gripper`
 
     def __getattr__(self, name: str) -> Any:
         """Return a field of the hot record, as the type that it stands for."""

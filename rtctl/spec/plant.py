@@ -68,6 +68,9 @@ class PlantTable(Table, frozen=True, kw_only=True):
     talker_ids: Annotated[
         tuple[CanId, ...], Meta(max_length=8, description="on each of them somebody else sends a frame every period")
     ] = ()
+    gripper_thing: Annotated[
+        float, Meta(ge=0.0, le=2.0, description="share of its way at which a gripper meets a thing; above 1: nothing")
+    ] = 2.0
     engine: Annotated[Literal["bullet", "mujoco"], Meta(description="what moves the arm")] = "bullet"
     model: (
         Annotated[

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from rtctl.plain import Json
-from rtctl.types import Goal, ObstacleEdit, Payload, Request, Shape, Task, Verb
+from rtctl.types import Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
@@ -21,6 +21,8 @@ def encode_request(tick: int, request: Request) -> bytes:
         ]
     if request.payload is not None:
         body["payload"] = tuple(request.payload)
+    if request.grip is not None:
+        body["grip"] = tuple(request.grip)
     return msgspec.json.encode(body)
 
 
@@ -40,7 +42,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
         )
         payload = None if body.get("payload") is None else Payload(*map(float, body["payload"]))
         verb = Verb[body["verb"].upper()]
-        return int(body["tick"]), Request(verb, None if goal is None else _goal(goal), edits, payload)
+        return int(body["tick"]), Request(verb, None if goal is None else _goal(goal), edits, payload, _grip(body))
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"not a request: {error}") from None
 
@@ -72,6 +74,13 @@ def _shape_of(body: Json) -> Shape:
         str(body.get("mesh", "")),
         base64.b64decode(body.get("cloud", ""), validate=True),  # as on the wire: 60 kB at most
     )
+
+
+def _grip(body: Json) -> Grip | None:
+    if body.get("grip") is None:
+        return None
+    closed, force, name = body["grip"]
+    return Grip(float(closed), float(force), str(name))
 
 
 def _goal(body: Json) -> Goal:
