@@ -68,8 +68,8 @@ class GripperTable(Table, frozen=True, kw_only=True):
     travel_m: Annotated[float, Meta(ge=1e-3, le=1.0, description="opening of the jaws, from closed to open")]
     force_max_N: Annotated[float, Meta(ge=0.1, le=2000.0, description="between the jaws")]
     speed_m_s: Annotated[float, Meta(ge=1e-3, le=2.0, description="of the opening")] = 0.1
-    kp_Nm_rad: Annotated[float, Meta(gt=0.0, le=500.0, description="of its drive's loop")] = 10.0
-    kd_Nms_rad: Annotated[float, Meta(gt=0.0, le=5.0)] = 1.0
+    kp_Nm_rad: Annotated[float, Meta(ge=0.1, le=500.0, description="of its drive's loop")] = 10.0
+    kd_Nms_rad: Annotated[float, Meta(ge=0.01, le=5.0)] = 1.0
 
 
 class BasePose(Table, frozen=True, kw_only=True):
