@@ -228,7 +228,7 @@ def test_the_plant_accelerates_as_pinocchio_does_with_motors_and_friction(name: 
 @pytest.mark.parametrize("name", ["puma560", "openarm_e2e"])
 @pytest.mark.parametrize("held", [(1,), (0, 2)])
 def test_joints_that_their_brakes_hold_leave_the_others_an_inertia_without_theirs(name: str, held: tuple[int, ...]):
-    """(A + J)_ff qdd_f = (tau - B qd - h - g)_f of the free joints f: what is held neither moves nor turns its motor."""
+    """(A + J)_ff qdd_f = (tau - B qd - h - g)_f of the free joints f: what is held does not turn its motor."""
     body, settings, n = arm(name).body, load_settings(config_of(name)), arm(name).n
     free = [j for j in range(n) if j not in held]
     friction = np.array([j.friction for j in settings.joints])

@@ -25,17 +25,17 @@ from rtctl.log.record.requests import encode_event, encode_request
 from rtctl.log.record.ring import attach, create
 from rtctl.log.record.scene import Scene
 from rtctl.log.record.tap import Tap
-from rtctl.types import ObstacleEdit, Request, Shape, State, Status, Verb
+from rtctl.types import F64, ObstacleEdit, Request, Shape, State, Status, Verb
 from rtctl.view import gate as gates
 from rtctl.view.body import Body
-from rtctl.view.follow import Live, Recorded, Story
+from rtctl.view.follow import Live, Recorded, Seen, Story
 from rtctl.view.gate import Gate
 from rtctl.view.known import known_obstacles
-from rtctl.view.moment import STATES, STATUSES, Reader
+from rtctl.view.moment import STATES, STATUSES, Reader, scan_of
 from rtctl.view.operator import LOCKED, Operator
 from rtctl.view.page import Page
-from rtctl.view.panel import bars_html, chart_data, state_html
 from rtctl.view.shapes import triangles
+from rtctl.view.words import bars_html, chart_data, state_html
 from rtctl.world.primitives import distance
 from tests.lab import ROOT
 from tests.test_console import BOUNDS, PERIOD
@@ -392,7 +392,7 @@ def ring_of(folder: Path) -> tuple[Any, Any]:
     header = make_header("one", ["a"], 4, 0.001, config=CONFIG, urdf=ONE)
     row = np.zeros(1, header.dtype)
     row["state"], row["status"], row["time"] = State.RUN, Status.MOVING, 0.5
-    row["rho"], row["tau_sent"], row["goal"] = [[0.05, np.inf, np.inf, np.inf]], [[5.0]], [[0.1, 0.2, 0.3]]
+    row["rho"], row["tau_sent"], row["goal"] = [[0.05, np.inf, np.inf, np.inf]], [[5.0]], [[0.0, 0.2, 0.02]]
     return create("rtctl-one-live.ring", 1 << 20, blob_of(header), [folder]), row[0]
 
 
@@ -425,8 +425,12 @@ def test_the_page_in_a_browser_shows_and_commands(tmp_path: Path) -> None:
         try:
             ring.put(1, row.tobytes(), 1)
             with browser.Browser(browser.DRAWS) as chrome:
-                used(chrome, page.gate.url)
-            assert [request.verb for request in got] == [Verb.STOP, Verb.ARM]
+                used(chrome, page)
+            assert [request.verb for request in got][:3] == [Verb.STOP, Verb.ARM, Verb.NONE]
+            goal = got[2].goal
+            assert goal is not None
+            np.testing.assert_allclose(goal.position[:2], [0.0, 0.2], atol=1e-3)  # along the arrow that was taken
+            assert 0.04 < goal.position[2] < 0.2
             until = time.monotonic() + 60.0
             while page.operator.unlocked and time.monotonic() < until:  # nobody looks any more: it locks itself
                 time.sleep(0.05)
@@ -437,10 +441,23 @@ def test_the_page_in_a_browser_shows_and_commands(tmp_path: Path) -> None:
             page.close()
 
 
-def used(chrome: browser.Browser, url: str) -> None:
-    """Stop, unlock and arm as a person would, and read what the page says."""
-    chrome.resize(500, 500)
-    chrome.go(url)
+def on_screen(page: Page, place: F64, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the pixel of a place (3,) [m], by a pinhole camera of its own."""
+    camera = next(iter(page._server.get_clients().values())).camera
+    ahead = camera.look_at - camera.position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    seen = place - camera.position
+    scale = 0.5 * size[1] / np.tan(0.5 * camera.fov) / (seen @ ahead)
+    return round(0.5 * size[0] + scale * (seen @ right)), round(0.5 * size[1] - scale * (seen @ np.cross(right, ahead)))
+
+
+def used(chrome: browser.Browser, page: Page) -> None:
+    """Stop, unlock, arm and drag the goal as a person would, and read what the page says."""
+    size = 1000, 500
+    chrome.wide(*size)
+    chrome.go(page.gate.url)
     chrome.wait("document.body.innerText.includes('Torque, share')")
     text = chrome.run("return document.body.innerText")
     assert "RUN" in text
@@ -453,6 +470,33 @@ def used(chrome: browser.Browser, url: str) -> None:
     chrome.wait(press.format("Arm"))
     chrome.run(f"{press.format('Arm')}.click()")
     chrome.wait("document.body.innerText.includes('arm: accepted')")
+    chrome.drawn()
+    goal, up = np.array([0.0, 0.2, 0.02]), np.array([0.0, 0.0, 0.08])
+    chrome.pull(on_screen(page, goal + up, size), on_screen(page, goal + 2.0 * up, size))
+    chrome.wait("document.body.innerText.includes('goal 0.000 0.200')")
+
+
+def test_a_map_is_where_the_scan_was_when_it_was_taken() -> None:
+    """A base that drives and turns beside a post: each scan is older than its record by another time."""
+    seen = Seen()
+    for k in range(40):
+        age, t = 0.01 * (k % 12), 0.02 * k
+        then = np.array([2.0 * (t - age), 0.3]), 0.1 + 0.5 * (t - age)
+        way = np.array([3.0, 4.0]) - then[0]
+        row = {
+            "time": t,
+            "x": np.array([2.0 * t, 0.3, 0.0]),
+            "xd": np.array([2.0, 0.0, 0.0]),
+            "heading": 0.1 + 0.5 * t,
+            "yaw_rate": 0.5,
+            "scan": np.array([np.nan, np.linalg.norm(way), np.inf]),
+            "scan_start": np.arctan2(way[1], way[0]) - then[1] + 0.2,
+            "scan_step": -0.2,
+            "scan_age": age,
+            "scan_offset": np.zeros(2),
+        }
+        seen.take(scan_of(row, float(row["heading"])))
+    np.testing.assert_allclose(seen.places(), [[3.0, 4.0, 0.02]])
 
 
 def test_a_page_without_viewers_sends_nothing(record: Recorded) -> None:

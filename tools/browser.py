@@ -27,6 +27,14 @@ SCRIPT = 120_000  # [ms] a page that draws in software answers late
 HELP = "apt-get install -y --no-install-recommends chromium chromium-driver"
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # of the WebDriver standard
 
+DRAWN = """(() => {
+  const scene = document.querySelector("canvas[data-engine]"), small = document.createElement("canvas");
+  small.width = small.height = 16;
+  const pen = small.getContext("2d");
+  pen.drawImage(scene, 0, 0, 16, 16);
+  return pen.getImageData(0, 0, 16, 16).data.some((value, at) => at % 4 === 3 && value > 0);
+})()"""  # whether the scene's canvas holds anything
+
 
 def missing() -> str:
     """Return why there is no browser, '' when there is one."""
@@ -102,7 +110,14 @@ class Browser:
 
     def phone(self, width: int, height: int) -> None:
         """Lay the page out as on a phone: a headless window cannot be that narrow."""
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
+        self._layout(width, height, 2, True)
+
+    def wide(self, width: int, height: int) -> None:
+        """Give the page itself a size; `resize` gives it to the window around it."""
+        self._layout(width, height, 1, False)
+
+    def _layout(self, width: int, height: int, scale: int, mobile: bool) -> None:
+        metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": mobile}
         self._ask("POST", "/goog/cdp/execute", {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics})
 
     def resize(self, width: int, height: int) -> None:
@@ -140,11 +155,28 @@ class Browser:
         pointer = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": steps}
         self._ask("POST", "/actions", {"actions": [pointer]})
 
+    def pull(self, start: tuple[int, int], stop: tuple[int, int]) -> None:
+        """Drag from one pixel of the page to another, slowly enough for a page that is drawn in software."""
+        steps: list[dict[str, Any]] = [{"type": "pointerMove", "duration": 0, "x": start[0], "y": start[1]}]
+        steps += [{"type": "pause", "duration": 500}, {"type": "pointerDown", "button": 0}]
+        for k in range(1, 6):
+            x, y = (round(a + (b - a) * k / 5) for a, b in zip(start, stop, strict=True))
+            steps += [{"type": "pointerMove", "duration": 100, "x": x, "y": y}, {"type": "pause", "duration": 200}]
+        steps.append({"type": "pointerUp", "button": 0})
+        pointer = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": steps}
+        self._ask("POST", "/actions", {"actions": [pointer]})
+
+    def drawn(self) -> None:
+        """Wait until the page's 3D scene has been drawn, and drawn anew."""
+        self.wait(DRAWN)
+        self.run("return new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
+
     def console(self) -> list[str]:
         """Return the errors of the page since the last call."""
         found = self._ask("POST", "/se/log", {"type": "browser"})
         return [entry["message"] for entry in found if entry["level"] in ("SEVERE", "WARNING")]
 
     def picture(self, path: Path) -> None:
-        """Keep what is on the screen."""
-        path.write_bytes(base64.b64decode(self._ask("GET", "/screenshot")))
+        """Keep what is on the screen. The standard's own way gives a page ten seconds, too few in software."""
+        shot = {"cmd": "Page.captureScreenshot", "params": {"format": "png"}}
+        path.write_bytes(base64.b64decode(self._ask("POST", "/goog/cdp/execute", shot)["data"]))

@@ -26,7 +26,7 @@ from tools.stress.play import CONFIGS, robot_of
 
 TIME = 0.05  # [s]
 NEAR = 0.002  # [m]
-ROBOTS = ("panda", "ur5", "planar4", "puma560", "openarm")
+ROBOTS = ("panda", "ur5", "planar4", "puma560", "openarm_e2e")
 
 
 def both(scenario: Scenario, where: Path, source: Path) -> tuple[Json, Json]:

@@ -1,7 +1,7 @@
 """Payload and friction, untold and told, for every arm that is shipped: how well and how soon it arrives.
 
     python -m tools.loads                  # the loads of tests/test_disturbance.py
-    python -m tools.loads openarm panda
+    python -m tools.loads openarm_e2e panda
 
 The plant's truth judges: error and angle at the end, the tip's hunting in the last second. The last row of each arm is
 told friction that is not there: too much is given.

@@ -2,9 +2,10 @@
 
     tau_i = kp (p - q) + kd (v - qd) + t        in the drive, on its own encoder, with no bus in it
 
-p, v come to rest from where the joint was, t carries gravity (and damps, where the joint's speed is known). A joint
-whose encoder lies gets no term of it: one whose position alone lies is damped, one of which nothing is true is let go,
-as is one whose drive has tripped. The others go on holding: they keep the rest from following.
+p, v come to rest from where the joint was, t carries gravity and, by the model, the way to rest and the pull of joints
+that fall (and damps, where the joint's speed is known). A joint whose encoder lies gets no term of it: one whose
+position alone lies is damped, one of which nothing is true is let go, as is one whose drive has tripped. The others go
+on holding: they keep the rest from following.
 
 When all rest, the arm is lowered down the slope of its potential energy, qd ~ -g(q), until gravity moves it no more,
 it lies on something, or its limits carry it; then kp and t fade, and torque is cut. m, c: as in `sensing`.
@@ -29,10 +30,12 @@ FLAT = 0.01  # of a joint's rating: gravity below it moves nothing worth lowerin
 PRESS = 0.1  # of a joint's rating, with which an arm that is lowered lies on what is in its way
 LOWERED = 60.0  # [s] after which lowering ends, whatever is left
 RESTS = 0.5  # [s] for which all joints must rest before torque is cut
-AT_LIMIT = 0.01  # [rad] from a joint's limit, where it is lowered no further
+AT_LIMIT, EDGE = 0.01, 0.005  # [rad] from a joint's limit: it is lowered no further; nothing takes it nearer
 SINK_RATE, SINK_TIME, SINK_LATEST = 1.0, 4.0, 12.0  # [1/s], [s] with which kp and t fade at the end, until all rest
 NOTICE = 0.1  # [s] after the onset of a stop, in which a joint that was let go has not come to its end
-JUMP = 0.1  # [rad] between two readings: the position is untrue, the speed need not be
+STEEPER = 2.0  # times the law's braking: a joint that comes near its limit comes to rest with more
+SWEEPS = 20  # of the joints that fall: how fast, of what the others do
+JUMP = 0.1  # [rad] from where the joint is held to be: the position is untrue, the speed need not be
 
 # numbers of the enumerations, as compiled code reads them
 _STOPPING, _SAFE_STOP = int(State.STOPPING), int(State.SAFE_STOP)
@@ -65,7 +68,7 @@ def _distrust(c: RecordRow, m: RecordRow, f: Feedback) -> None:
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
         if f.replies[i] > 0 and not (math.isfinite(f.q[i]) and math.isfinite(f.qd[i])):
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
-        elif f.replies[i] > 0 and abs(f.q[i] - m.q_previous[i]) > JUMP:  # see `sensing.plausible_feedback`
+        elif f.replies[i] > 0 and abs(f.q[i] - m.q[i]) > JUMP:  # it was not taken, see `sensing.plausible_feedback`
             m.no_position = m.no_position | bit
 
 
@@ -127,6 +130,44 @@ def _obstructed(c: RecordRow, m: RecordRow, around: Surroundings, u: F64) -> boo
 
 
 @kernel
+def _ahead(c: RecordRow, m: RecordRow, i: int, way: float) -> float:
+    """Return how far [rad] joint i may go the way of a speed."""
+    return float(c.q_max[i] - EDGE - m.own_p[i] if way > 0.0 else m.own_p[i] - c.q_min[i] - EDGE)
+
+
+@kernel
+def _braking(c: RecordRow, m: RecordRow, i: int) -> float:
+    """Return the deceleration [rad/s2] of joint i: as it decays, and enough to be at rest before its limit."""
+    v = m.own_v[i]
+    ahead = max(_ahead(c, m, i, v), 1e-3)
+    rate = min(c.stop_decay * abs(v), c.braking[i])
+    return float(max(rate, min(0.5 * v * v / ahead, STEEPER * c.braking[i])))
+
+
+@kernel
+def _inertial(c: RecordRow, m: RecordRow, model: Model, g: F64, qdd: F64) -> F64:
+    """Return the torque (n,) [Nm] beside gravity's of joints held at accelerations qdd (n,) [rad/s2]: A qdd + h + B v.
+
+    Those that are let go fall meanwhile: A_ll qdd_l = (t - g - h - B qd)_l - A_lh qdd_h, unless they are at their end.
+    """
+    n, qdd = g.shape[0], qdd.copy()
+    for _ in range(SWEEPS if m.lost != 0 else 0):  # Gauss-Seidel: exact at once for one joint
+        for i in range(n):
+            if m.lost >> i & 1:
+                net = m.own_t[i] - (g[i] + model.h[i] + c.viscous[i] * m.qd[i])
+                for j in range(n):
+                    net -= model.A[i, j] * qdd[j] if j != i else 0.0
+                ends = (m.q[i] <= c.q_min[i] and net < 0.0) or (m.q[i] >= c.q_max[i] and net > 0.0)
+                qdd[i] = 0.0 if ends else net / model.A[i, i]
+    tau = model.h.copy()
+    for i in range(n):
+        tau[i] += c.viscous[i] * m.own_v[i]
+        for j in range(n):
+            tau[i] += model.A[i, j] * qdd[j]
+    return tau
+
+
+@kernel
 def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F64) -> None:
     """Move p, v of the joints on by a tick, and take the next phase when its time has come."""
     n, since = g.shape[0], (m.tick - m.own_since) * c.dt
@@ -143,12 +184,13 @@ def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F6
     elif m.own_phase == BRAKING and since >= HOLD_TIME:
         m.own_phase, m.own_since, since = LOWERING, m.tick, 0.0
     for i in range(n):
-        rate = JOINT_SPEED / GATHER
-        if m.own_phase == BRAKING:
-            rate = min(c.stop_decay * abs(m.own_v[i]), c.braking[i])
+        rate = JOINT_SPEED / GATHER if m.own_phase != BRAKING else _braking(c, m, i)
+        most = max(_ahead(c, m, i, u[i]), 0.0) / GATHER  # it comes to its limit softly
+        u[i] = min(max(u[i], -most), most)
+        low, high = min(c.q_min[i] + EDGE, m.own_p[i]), max(c.q_max[i] - EDGE, m.own_p[i])
         m.own_v[i] += min(max(u[i] - m.own_v[i], -rate * c.dt), rate * c.dt)
         p = m.own_p[i] + m.own_v[i] * c.dt
-        m.own_p[i] = min(max(p, c.q_min[i]), c.q_max[i])
+        m.own_p[i] = min(max(p, low), high)
         if m.own_p[i] != p:
             m.own_v[i] = 0.0
     if m.own_phase == SINKING:
@@ -157,6 +199,19 @@ def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F6
             m.own_kp[i], m.own_g[i] = fade * m.own_kp[i], fade * m.own_g[i]
         if since >= SINK_LATEST or (since >= SINK_TIME and m.rest * c.dt >= RESTS):
             m.off = 1
+
+
+@kernel
+def _let_go(m: RecordRow, f: Feedback) -> None:
+    """Take the terms that are not to be trusted from the drives' loops; f: as it came."""
+    for i in range(f.q.shape[0]):
+        bit, off = 1 << i, f.drive[i] != 1
+        if off or m.no_speed & bit:
+            m.lost = m.lost | bit
+            m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0
+            m.own_t[i] = 0.0 if off else m.own_t[i]
+        elif m.no_position & bit:
+            m.own_kp[i], m.own_v[i] = 0.0, 0.0
 
 
 @kernel
@@ -171,19 +226,19 @@ def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surr
     _distrust(c, m, f)
     if m.own_phase != SINKING:
         m.own_g[:n] = g
+    _let_go(m, f)
+    qdd = -m.own_v[:n]
     _go_on(c, m, model, around, g)
     for i in range(n):
-        bit, step = 1 << i, c.tau_rate[i] * c.dt
-        heard = f.age[i] <= c.safety_lost_periods * c.dt
-        speed_true, position_true = not m.no_speed >> i & 1, not m.no_position >> i & 1
-        if f.drive[i] != 1 or not speed_true:
-            m.lost = m.lost | bit
-        t = m.own_g[i]
-        if m.lost & bit:
-            t, m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0, 0.0
-        elif not position_true:
-            m.own_kp[i], m.own_v[i] = 0.0, 0.0
-        elif heard and f.replies[i] > 0:
+        most = STEEPER * c.braking[i]
+        qdd[i] = min(max((qdd[i] + m.own_v[i]) / c.dt, -most), most)
+    inertial = _inertial(c, m, model, g, qdd)
+    for i in range(n):
+        step, heard = c.tau_rate[i] * c.dt, f.age[i] <= c.safety_lost_periods * c.dt
+        t = m.own_g[i] + inertial[i]
+        if m.lost >> i & 1:
+            t = 0.0
+        elif heard and f.replies[i] > 0 and not m.no_position >> i & 1:
             t -= c.stop_damping[i] * (m.qd[i] - m.own_v[i])
         if not math.isfinite(t):
             t = 0.0

@@ -18,7 +18,7 @@ from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, robot_file
 from rtctl.spec.urdf import urdf_file
 
-ROBOTS = 6  # derived ones that a process keeps
+ROBOTS = 12  # derived ones that a process keeps
 
 
 class Variant(NamedTuple):

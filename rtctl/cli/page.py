@@ -1,6 +1,7 @@
 """`rtctl view`: a robot in the browser, live or from a log; and the same page beside `rtctl sim --view`."""
 
 import argparse
+import os
 import signal
 import subprocess
 import sys
@@ -61,6 +62,7 @@ def _view(arguments: argparse.Namespace) -> int:
     from rtctl.view.page import Page
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    parent = os.getppid()
     source, operator = _source(arguments)
     page = Page(source, operator, arguments.host, arguments.port)
     try:
@@ -71,7 +73,7 @@ def _view(arguments: argparse.Namespace) -> int:
             webbrowser.open(page.gate.url)
         if arguments.ring:
             page.when_seen(lambda: print(OPENED, flush=True))
-        page.run()
+        page.run(lambda: bool(arguments.ring) and os.getppid() != parent)  # a simulation's page ends with it
     except KeyboardInterrupt:  # the way one leaves it
         pass
     finally:

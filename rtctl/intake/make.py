@@ -202,7 +202,7 @@ def _settings(
     for k, joint in enumerate(joints):
         away = max(float(np.linalg.norm(x - t[k + 1])), 0.05)
         # a joint that is much faster than the tip needs throws it past a singularity
-        speeds.append(round(min(joint.speed, max(SPEED_MIN, 5.0 * v_max / away)), 3))
+        speeds.append(math.floor(1e3 * min(joint.speed, max(SPEED_MIN, 5.0 * v_max / away))) / 1e3)
     influence = round(min(0.1, max(0.04, 0.13 * size)), 3)
     return Settings(
         name=name,

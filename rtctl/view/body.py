@@ -57,6 +57,7 @@ class Body:
         sound = [p for p in points if len(p) == 5 and 0 <= int(p[0]) < len(self._carriers)]
         self.points = [(self._carriers[int(p[0])], np.array(p[1:4], np.float64), float(p[4])) for p in sound]
         self.pieces = pieces_of(self.model, header, folder)
+        pin.forwardKinematics(self.model, self.data, self._q)
 
     def _index(self, name: str) -> tuple[int, bool]:
         """Return where a joint's position stands in the model's, and whether it is there as cosine and sine."""
@@ -79,6 +80,17 @@ class Body:
         at = self.base @ self.data.oMi[joint].homogeneous
         at = at if X is None else at @ X
         return at[:3, 3], quaternion(at[:3, :3])
+
+    def reach(self) -> float:
+        """Return how far [m] from its base the arm has a part, where it stands now; 1 m for one without parts."""
+        far = [
+            np.linalg.norm(
+                piece.vertices @ (X := self.data.oMi[piece.joint].homogeneous @ piece.X)[:3, :3].T + X[:3, 3], axis=1
+            ).max()
+            for piece in self.pieces
+            if len(piece.vertices)
+        ]
+        return float(max(far, default=1.0))
 
     def point(self, index: int) -> F64 | None:
         """Return where (3,) [m] a protected point is now; None when there is none of that index."""

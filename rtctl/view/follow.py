@@ -25,6 +25,8 @@ SAID = 12  # events that a page lists
 TRAIL = 300  # places behind, at DRAWN
 CHART = 30.0  # [s] that a chart shows
 CHART_HZ = 10.0
+CELL = 0.25  # [m] of what a base has seen
+CELLS = 6000  # the newest, that are kept
 DRAWN = 30.0  # [Hz] of moments
 ROWS = 40_000  # records of a log that are held: 22 minutes at DRAWN, of a longer log fewer a second
 REQUEST, EVENT = int(Kind.REQUEST), int(Kind.EVENT)
@@ -40,6 +42,24 @@ class Sample(NamedTuple):
     torque: float  # largest share of the rated one
 
 
+class Seen:
+    """Where a base's scan has met something: cells of the floor, the newest of them."""
+
+    def __init__(self) -> None:
+        self._cells: dict[tuple[int, int], None] = {}
+
+    def take(self, scan: F64) -> None:
+        """Take what a scan met, (k, 3) [m]."""
+        for x, y in np.unique(np.round(scan[:, :2] / CELL).astype(int), axis=0).tolist():
+            self._cells[(x, y)] = self._cells.pop((x, y), None)  # the newest last
+        for old in list(self._cells)[: max(0, len(self._cells) - CELLS)]:
+            del self._cells[old]
+
+    def places(self) -> F64:
+        """Return the cells' middles (k, 3) [m]."""
+        return np.array([[x * CELL, y * CELL, 0.02] for x, y in self._cells]).reshape(-1, 3)
+
+
 class Story:
     """What led to a moment: obstacles, events, the way behind, the last seconds as a chart."""
 
@@ -49,6 +69,7 @@ class Story:
         self.said: deque[tuple[float, str]] = deque(maxlen=SAID)
         self.trail: deque[F64] = deque(maxlen=TRAIL)
         self.chart: deque[Sample] = deque(maxlen=round(CHART * CHART_HZ))
+        self.seen = Seen()
         self.moment: Moment | None = None
         self._around = Surroundings(header)
 
@@ -84,6 +105,8 @@ class Story:
         names = [self._around.name_of(k) for k in range(len(record["rho"]))]
         m = self.moment = self.reader.moment(record, names)
         self.trail.append(m.place)
+        if len(m.scan):
+            self.seen.take(m.scan)
         if not self.chart or m.time - self.chart[-1].time >= 1.0 / CHART_HZ:
             near = m.clearances[0][1] if m.clearances else np.nan
             torque = max((share for _, share in m.torques), default=0.0)

@@ -15,6 +15,7 @@ from rtctl.plain import Json
 from rtctl.types import F64, RecordRow, State, Status
 
 FORCE_SEEN = 2.0  # [N] smaller forces are not drawn
+OLD = 0.5  # [s] an older scan is not drawn
 NEAR = 1e3  # [m] beyond it a distance is none
 
 STATES = {
@@ -93,7 +94,7 @@ class Reader:
         faults = tuple((f.name, f.text) for i, f in enumerate(self.faults) if bits >> i & 1)
         rho = [(names[k] or f"obstacle {k}", float(d)) for k, d in enumerate(record["rho"]) if d < NEAR]
         if self.is_base and record["rho_seen"] < NEAR:
-            rho.append(("what the scan sees", float(record["rho_seen"])))
+            rho.append(("seen by scan", float(record["rho_seen"])))
         aimed = status != "no_goal" and state in ("ARMED", "RUN")
         goal = np.array(record["goal"], np.float64) if aimed else None
         place = np.array(record["x"], np.float64)
@@ -102,7 +103,7 @@ class Reader:
             time=float(record["time"]),
             state=state,
             status=status,
-            says=says(state, status),
+            says=says(state, status, bool(faults)),
             faults=faults,
             place=place,
             heading=heading,
@@ -113,7 +114,7 @@ class Reader:
             torques=self._torques(record),
             forces=() if self.is_base else _forces(record),
             way=self._way(record, place, goal),
-            scan=_scan(record, heading) if self.is_base else np.zeros((0, 3)),
+            scan=scan_of(record, heading) if self.is_base else np.zeros((0, 3)),
             q=np.zeros(0) if self.is_base else np.array(record["q"], np.float64),
         )
 
@@ -134,8 +135,17 @@ class Reader:
         return way
 
 
-def says(state: str, status: str) -> str:
-    """Return in words what the robot does."""
+def length(metres: float) -> str:
+    """Return a length in the unit that people would say it in."""
+    if abs(metres) >= 1.0:
+        return f"{metres:.2f} m"
+    return f"{1e3 * metres:.{1 if abs(metres) < 0.01 else 0}f} mm"
+
+
+def says(state: str, status: str, by_fault: bool) -> str:
+    """Return in words what the robot does; by_fault: whether a fault is in force."""
+    if state == "SAFE_STOP" and not by_fault:
+        return "Stopped. Reset, then arm to go on."
     if state == "RUN":
         return STATUSES.get(status, status.replace("_", " "))
     return STATES.get(state, state)
@@ -177,13 +187,17 @@ def _forces(record: RecordRow) -> tuple[tuple[int, F64, int], ...]:
     return tuple((k, force[k], int(record["point"][k])) for k in seen)
 
 
-def _scan(record: RecordRow, heading: float) -> F64:
-    """Return where (k, 3) [m] the scan met something, from the pose of now: it is younger than a turn of the sensor."""
+def scan_of(record: RecordRow, heading: float) -> F64:
+    """Return where (k, 3) [m] the scan met something, from where the base was then; heading [rad] of now."""
+    age = float(record["scan_age"])
+    if not 0.0 <= age < OLD:
+        return np.zeros((0, 3))
     ranges = np.array(record["scan"], np.float64)
     met = np.flatnonzero(np.isfinite(ranges) & (ranges > 0.0))
-    angle = heading + float(record["scan_start"]) + met * float(record["scan_step"])
-    c, s = np.cos(heading), np.sin(heading)
+    then = heading - age * float(record["yaw_rate"])
+    angle = then + float(record["scan_start"]) + met * float(record["scan_step"])
+    c, s = np.cos(then), np.sin(then)
     ahead, left = (float(v) for v in record["scan_offset"])
-    origin = np.array(record["x"][:2]) + np.array([c * ahead - s * left, s * ahead + c * left])
+    origin = (record["x"] - age * record["xd"])[:2] + np.array([c * ahead - s * left, s * ahead + c * left])
     flat = origin + ranges[met, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     return np.column_stack([flat, np.full(len(flat), 0.1)])

@@ -43,9 +43,9 @@ class Operator:
         return self._ask({"verb": name}, f"{name}: accepted", always=name == "stop")
 
     def hold(self, place: F64, is_base: bool) -> Answer:
-        """Ask to stay where it is now: a goal there, so that it brakes along its way and stays under control."""
-        message: Json = {"verb": "goal", "position_m": _rounded(place)}
-        return self._ask(message if is_base else {**message, "hold": "orientation"}, "hold: accepted")
+        """Ask to stay here: an arm by its verb; a base, which has none, by a goal where it is now."""
+        message: Json = {"verb": "goal", "position_m": _rounded(place)} if is_base else {"verb": "hold"}
+        return self._ask(message, "hold: accepted")
 
     def goal(self, place: F64, keeps_orientation: bool) -> Answer:
         """Ask to go to a place (3,) [m]."""

@@ -29,6 +29,7 @@ class Page:
         with redirect_stdout(io.StringIO()):  # it prints the address behind the gate, which is nobody's to open
             self._server = viser.ViserServer(host="127.0.0.1", port=0, label="rtctl", verbose=False)
         self.gate = Gate(host, port, self._server.get_port())
+        self._server.on_client_connect(lambda client: self._stage.face(client))
         self._record = source if isinstance(source, Recorded) else None
         self._begin(source.story)
 
@@ -71,7 +72,6 @@ class Page:
         if story is not self._story:
             if story.header is not self._story.header:
                 self._begin(story)
-            self._stage.forget()
             self._story = story
         if not self._server.get_clients():
             self._panel.lock()  # whoever unlocked it looks no more

@@ -1,26 +1,42 @@
 """The part of a page with words, buttons, bars and charts."""
 
-import html
-from collections.abc import Sequence
-
 import numpy as np
 import viser
 from viser import uplot
 
 from rtctl.types import F64
-from rtctl.view.follow import Recorded, Sample, Story
-from rtctl.view.moment import Moment, Reader
+from rtctl.view.follow import Recorded, Story
+from rtctl.view.handles import Handles
+from rtctl.view.moment import Reader
 from rtctl.view.operator import Answer, Operator, beside
-from rtctl.view.stage import Handles, Shown, Stage
+from rtctl.view.stage import Shown, Stage
+from rtctl.view.words import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    RED,
+    STYLE,
+    bars_html,
+    chart_data,
+    events_html,
+    note_html,
+    state_html,
+)
 
-COLOURS = {"RUN": "#1b8a3c", "ARMED": "#b7791f", "STOPPING": "#b7791f", "SAFE_STOP": "#c0272d", "FAULT": "#c0272d"}
-GREEN, AMBER, RED, GREY = "#1b8a3c", "#c98a12", "#c0272d", "#8a8f98"
 WARNING = (
     "<b>Not an emergency stop.</b> Stop here goes through this browser, the network and the daemon. "
     "Keep the hardware emergency stop in reach."
 )
-STYLE = "font: 13px/1.45 system-ui, sans-serif; color: #23262b; padding: 0 2px; overflow-wrap: anywhere"
-FEW = 6  # obstacles with a bar
+LOOK = """<style>
+canvas[data-engine^="three"] { background: linear-gradient(#f3f5f8, #dde2ea) }
+@media (max-width: 36em) {
+  .mantine-Paper-root[style*="position: fixed"] { width: 100% !important; max-height: 50% !important }
+  .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100% !important }
+}
+</style>"""  # on a phone the panel is the lower half of the page
+SPEEDS = {"0.1 ×": 0.1, "0.25 ×": 0.25, "1 ×": 1.0, "4 ×": 4.0, "10 ×": 10.0}
+VERBS = ("Arm", "Hold", "Float", "Disarm", "Reset")  # of an arm
 SIZES = {"sphere": 0.05, "box": 0.06}  # [m] radius and half side of what a page adds
 
 
@@ -44,12 +60,15 @@ class Panel:
         self._texts: dict[str, str] = {}
         self.gui.set_panel_label(f"rtctl {story.header.robot}")
         self.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(30, 80, 160))
+        self.gui.add_html(LOOK)
         self._state = self.gui.add_html("")
         if record is None:
             self._operate()
         else:
             self._playback(record)
-        with self.gui.add_folder("Clearance and torque", expand_by_default=True):
+        with self.gui.add_folder(
+            "Clearance" if self.reader.is_base else "Clearance and torque", expand_by_default=True
+        ):
             self._bars = self.gui.add_html("")
         with self.gui.add_folder("Last 30 s", expand_by_default=True):
             self._charts = _charts(self.gui, self.reader)
@@ -69,7 +88,8 @@ class Panel:
                 "Unlock", False, hint="Read-only until this is set. For all who see this page."
             )
             self._lock.on_update(lambda event: self._unlock(bool(self._lock.value)))
-            self._verbs = gui.add_button_group("", ("Arm", "Hold", "Disarm", "Reset"), visible=False)
+            verbs = ("Arm", "Hold", "Disarm", "Reset") if self.reader.is_base else VERBS
+            self._verbs = gui.add_button_group("", verbs, visible=False)
             self._verbs.on_click(lambda event: self._say(event.client, self._verb(str(self._verbs.value))))
             self._keeps = gui.add_checkbox(
                 "Keep orientation", False, hint="A goal by hand keeps the tip's orientation."
@@ -93,7 +113,7 @@ class Panel:
         else:
             for name in self.handles.names():
                 self.handles.remove(name)
-        self.put("_answer", _note("Drag the arrows at the goal." if wanted else "Read-only.", GREY))
+        self.put("_answer", note_html("Drag the arrows at the goal." if wanted else "Read-only.", GREY))
 
     def lock(self) -> None:
         """Lock the page: nobody looks any more."""
@@ -146,7 +166,7 @@ class Panel:
             client.add_notification("Refused", answer.text, auto_close_seconds=8.0, color="red")
 
     def _show(self, answer: Answer) -> None:
-        self.put("_answer", _note(answer.text, GREEN if answer.ok else RED))
+        self.put("_answer", note_html(answer.text, GREEN if answer.ok else RED))
 
     def _playback(self, record: Recorded) -> None:
         first, last = record.span
@@ -155,7 +175,7 @@ class Panel:
             self._slider = self.gui.add_slider("t [s]", first, max(last, first + 0.01), 0.01, first)
             self._slider.on_update(lambda event: record.seek(float(self._slider.value)) if event.client else None)
             play = self.gui.add_button_group("", ("Play", "Pause", "Start"))
-            self._speed = self.gui.add_dropdown("Speed", ("0.1", "0.25", "1", "4"), initial_value="1")
+            self._speed = self.gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 ×")
 
             @play.on_click
             def _(event: object) -> None:
@@ -167,10 +187,18 @@ class Panel:
         """Go on in a log by what has elapsed [s]."""
         if self.record is None or not self._playing:
             return
-        self.record.seek(self.record.at + elapsed * float(self._speed.value))
+        self.record.seek(self.record.at + elapsed * SPEEDS[self._speed.value])
 
     def _choices(self) -> None:
         with self.gui.add_folder("Show", expand_by_default=False):
+            if self.reader.is_base:
+                look = self.gui.add_button_group("Look at", ("Rover", "Trip"))
+
+                @look.on_click
+                def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
+                    if event.client is not None:
+                        self.stage.face(event.client, look.value == "Trip")
+
             start = self.stage.shown
             boxes = {
                 "meshes": self.gui.add_checkbox("Robot", start.meshes),
@@ -194,108 +222,37 @@ class Panel:
         """Show a story; remark: what is to be said beside it."""
         self._story, m = story, story.moment
         if m is None:
-            self.put("_state", _note(remark or "Waiting for the first tick.", AMBER))
+            self.put("_state", note_html(remark or "Waiting for the first tick.", AMBER))
             return
         self.put("_state", state_html(m, story.detail, remark))
         self.put("_bars", bars_html(m, self.reader))
-        self.put("_events", _events_html(story.said))
+        self.put("_events", events_html(story.said))
         if self.record is not None:
             self._slider.value = round(float(self.record.at), 2)  # type: ignore[misc]
         elif self.operator.unlocked and m.goal is not None:
             self.handles.put("goal", m.goal)
-        for chart, data in zip(self._charts, chart_data(story.chart), strict=True):
+        for chart, data in zip(self._charts, chart_data(story.chart, self.reader.is_base), strict=True):
             chart.data = data
 
 
-def state_html(m: Moment, detail: str, remark: str) -> str:
-    """Return state, diagnosis and faults in words."""
-    colour = COLOURS.get(m.state, GREY)
-    lines = [
-        f'<span style="background:{colour}; color:white; font-weight:600; padding:2px 8px; border-radius:4px">'
-        f"{html.escape(m.state)}</span> <span style='color:{GREY}'>{m.time:.1f} s</span>",
-        f"<div style='font-size:15px; margin-top:6px'>{html.escape(m.says)}</div>",
-    ]
-    if detail and m.status not in ("no_goal", "moving", "arrived"):
-        lines.append(f"<div>Held by: {html.escape(detail)}.</div>")
-    if m.goal is not None:
-        lines.append(f"<div style='color:{GREY}'>{1e3 * m.error:.1f} mm to the goal, {m.speed:.2f} m/s</div>")
-    for name, text in m.faults:
-        lines.append(f"<div style='color:{RED}'><b>{html.escape(name)}</b>: {html.escape(text)}</div>")
-    if remark:
-        lines.append(f"<div style='color:{AMBER}; font-weight:600'>{html.escape(remark)}</div>")
-    return f'<div style="{STYLE}; padding-bottom:6px">{"".join(lines)}</div>'
-
-
-def bars_html(m: Moment, reader: Reader) -> str:
-    """Return clearances by obstacle and torques by joint as bars."""
-    full, near = 2.0 * reader.influence, max(reader.clearance, 1e-3)
-    rows = []
-    for name, d in m.clearances[:FEW]:
-        colour = RED if d < near else AMBER if d < reader.influence else GREEN
-        rows.append(_bar(name, d / full, f"{1e3 * d:.0f} mm", colour))
-    if not m.clearances:
-        rows.append(f"<div style='color:{GREY}'>No obstacle near.</div>")
-    if m.torques:
-        rows.append(f"<div style='color:{GREY}; margin-top:6px'>Torque, share of the joint's rated</div>")
-    for name, share in m.torques:
-        rows.append(_bar(name, share, f"{100 * share:.0f} %", RED if share > 0.9 else AMBER if share > 0.7 else GREEN))
-    note = f"<div style='color:{GREY}'>Clearance by the controller's spheres</div>"
-    return f'<div style="{STYLE}; font-size:12px">{note}{"".join(rows)}</div>'
-
-
-def _bar(name: str, share: float, text: str, colour: str) -> str:
-    width = 100.0 * min(max(share, 0.0), 1.0)
-    return (
-        '<div style="display:flex; align-items:center; gap:6px; margin:2px 0">'
-        '<span style="flex:0 0 38%; overflow:hidden; text-overflow:ellipsis; white-space:nowrap">'
-        f"{html.escape(name)}</span>"
-        '<span style="flex:1; background:#e6e8ec; border-radius:3px; height:9px">'
-        f'<span style="display:block; width:{width:.0f}%; background:{colour}; border-radius:3px; height:9px"></span>'
-        "</span>"
-        f'<span style="flex:0 0 58px; text-align:right; font-variant-numeric:tabular-nums">{text}</span></div>'
-    )
-
-
-def _note(text: str, colour: str) -> str:
-    return f'<div style="{STYLE}; color:{colour}">{html.escape(text)}</div>'
-
-
-def _events_html(said: Sequence[tuple[float, str]]) -> str:
-    rows = "".join(
-        f"<div><span style='color:{GREY}'>{t:.2f} s</span> {html.escape(text)}</div>" for t, text in reversed(said)
-    )
-    return f'<div style="{STYLE}; font-size:12px">{rows or "None yet."}</div>'
-
-
-def chart_data(chart: Sequence[Sample]) -> tuple[tuple[F64, ...], ...]:
-    """Return what the two charts draw: time [s], then error and clearance [mm]; time, then speed and torque."""
-    rows = np.array(list(chart) or [Sample(0.0, np.nan, np.nan, np.nan, np.nan)], np.float64)
-    t = rows[:, 0]
-    return (t, 1e3 * rows[:, 1], 1e3 * rows[:, 2]), (t, rows[:, 3], rows[:, 4])
-
-
 def _charts(gui: viser.GuiApi, reader: Reader) -> tuple[viser.GuiUplotHandle, ...]:
-    first, second = chart_data(())
-    reach = 2e3 * reader.influence
-    return (
+    unit, size = ("m", 5.0) if reader.is_base else ("mm", 2e3)
+    lengths = _lines((f"to goal [{unit}]", BLUE), (f"clearance [{unit}]", AMBER))
+    shares = _lines(("speed [m/s]", GREEN), *(() if reader.is_base else (("largest torque, share", RED),)))
+    tops = size * reader.influence, max(1.0, reader.v_max)
+    return tuple(
         gui.add_uplot(
-            first,
-            (
-                uplot.Series(label="t [s]"),
-                uplot.Series(label="to goal [mm]", stroke="#1e50a0", width=1.5),
-                uplot.Series(label="clearance [mm]", stroke="#c98a12", width=1.5),
-            ),
-            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, reach))},
+            data,
+            series,
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.1 * top))},
             height=150,
-        ),
-        gui.add_uplot(
-            second,
-            (
-                uplot.Series(label="t [s]"),
-                uplot.Series(label="speed [m/s]", stroke="#1b8a3c", width=1.5),
-                uplot.Series(label="torque ratio" if not reader.is_base else "-", stroke="#c0272d", width=1.5),
-            ),
-            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, max(1.0, 1.2 * reader.v_max)))},
-            height=150,
-        ),
+            padding=(12, 8, 0, 0),
+        )
+        for data, series, top in zip(chart_data((), reader.is_base), (lengths, shares), tops, strict=True)
     )
+
+
+def _lines(*lines: tuple[str, str]) -> tuple[uplot.Series, ...]:
+    """Return the lines of a chart over time, each with a label and a colour."""
+    named = (uplot.Series(label=label, stroke=colour, width=1.5) for label, colour in lines)
+    return (uplot.Series(label="t [s]"), *named)

@@ -1,7 +1,6 @@
 """The 3D part of a page: robot, obstacles, forces, goal, ways."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from rtctl.log.record.surroundings import Thing
 from rtctl.plain import Json
 from rtctl.types import F64
 from rtctl.view.body import Body
-from rtctl.view.follow import Story
+from rtctl.view.follow import CELL, Story
 from rtctl.view.moment import Moment, Reader
 from rtctl.view.shapes import ball, triangles
 
@@ -28,9 +27,15 @@ GOAL, AHEAD, BEHIND, FORCE, SPHERE, SEEN = (
 )
 NEWTON = 0.004  # [m] length of an arrow for 1 N
 LONGEST, SHORTEST = 0.5, 0.03  # [m] of an arrow
-MAP_CELL = 0.1  # [m] of what a base has seen
-MAP_MOST = 6000  # cells that are drawn
-SLOW = 6  # frames from one drawing of trail and map to the next
+FLOOR = 2.0, 200.0  # [m] half of an arm's, a base's
+SLOW = 6  # frames from one drawing of ways and map to the next
+FROM = np.array([0.66, -0.61, 0.44]) / np.linalg.norm([0.66, -0.61, 0.44])  # whence a camera looks at first
+ABOVE = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])  # the same for a base
+SIZE = 0.66  # of an arm's reach: radius of what a camera takes in
+BASE_SIZE = 5.0  # [m] the same for a base
+FOV = math.radians(45.0)  # from top to bottom
+NARROW, WIDE = 0.75, 1.6  # aspects: below the first one the panel is under the scene; of a common window
+BESIDE, BELOW = 0.22, 0.5  # shares of width and height that the panel has
 
 
 class Shown(NamedTuple):
@@ -55,15 +60,16 @@ class Stage:
     """Draws stories into a scene; what has not changed is not sent again."""
 
     def __init__(self, server: viser.ViserServer, reader: Reader, body: Body | None) -> None:
-        self.scene, self.reader, self.body = server.scene, reader, body
+        self._server, self.scene, self.reader, self.body = server, server.scene, reader, body
         self.shown = Shown()
         self._things: dict[str, _Thing] = {}
         self._parts: list[tuple[SceneNodeHandle, int, F64]] = []
         self._spheres: list[tuple[SceneNodeHandle, int, F64]] = []
         self._arrows: SceneNodeHandle | None = None
-        self._cells: dict[tuple[int, int], None] = {}
         self._frame = 0
-        self.scale = 5.0 if reader.is_base else 1.0
+        self._place: F64 = np.zeros(3)  # [m] of the moment that is drawn
+        self._goal_now: F64 | None = None
+        self.scale = 25.0 if reader.is_base else 1.0
         self._furnish(server)
 
     def _furnish(self, server: viser.ViserServer) -> None:
@@ -71,18 +77,17 @@ class Stage:
         scene.set_up_direction("+z")
         scene.add_grid(
             "/floor",
-            4.0 * big,
-            4.0 * big,
-            cell_size=0.1 * big,
-            section_size=0.5 * big,
+            2.0 * FLOOR[self.reader.is_base],
+            2.0 * FLOOR[self.reader.is_base],
+            cell_size=1.0 if self.reader.is_base else 0.1,
+            section_size=5.0 if self.reader.is_base else 0.5,
             plane_opacity=0.0,
             cell_color=(226, 228, 232),
             section_color=(198, 202, 210),
             position=(0.0, 0.0, -0.002),
         )
-        base = self.body.base[:3, 3] if self.body is not None else np.zeros(3)
-        server.initial_camera.position = base + np.array([1.7, -1.5, 1.25]) * (1.0 if big == 1.0 else 6.0)
-        server.initial_camera.look_at = base + np.array([0.25, 0.0, 0.35]) * (1.0 if big == 1.0 else 0.0)
+        server.initial_camera.fov = FOV
+        server.initial_camera.position, server.initial_camera.look_at = self._camera(WIDE)
         if self.body is not None:
             for k, piece in enumerate(self.body.pieces):
                 part = scene.add_mesh_simple(
@@ -107,12 +112,36 @@ class Stage:
         else:
             self._base = scene.add_frame("/base", show_axes=False)
             for k, (x, y, radius) in enumerate(p for p in self.reader.points if len(p) == 3):
-                scene.add_cylinder(f"/base/{k}", float(radius), 0.2, SPHERE, opacity=0.8, position=(x, y, 0.1))
-            nose = np.array([[[0.0, 0.0, 0.25], [0.8, 0.0, 0.25]]])
-            scene.add_arrows("/base/nose", nose, FORCE, shaft_radius=0.03, head_radius=0.08, head_length=0.2)
+                scene.add_cylinder(f"/base/{k}", float(radius), 0.2, SPHERE, position=(x, y, 0.1))
+            nose = np.array([[[0.0, 0.0, 0.3], [1.2, 0.0, 0.3]]])
+            scene.add_arrows("/base/nose", nose, BEHIND, shaft_radius=0.06, head_radius=0.18, head_length=0.4)
         self._tip = scene.add_icosphere("/tip", 0.008 * big, BEHIND, visible=self.body is not None)
-        self._goal = scene.add_icosphere("/goal", 0.018 * big, GOAL, opacity=0.9, visible=False)
+        self._goal = scene.add_icosphere("/goal", 0.014 * big, GOAL, opacity=0.9, visible=False)
         self._lines: dict[str, SceneNodeHandle] = {}
+
+    def face(self, client: viser.ClientHandle, all_of_it: bool = True) -> None:
+        """Turn a viewer's camera to the robot, so that the panel hides none of it; of a base to its goal, too."""
+        client.camera.fov = FOV
+        client.camera.position, client.camera.look_at = self._camera(client.camera.aspect, all_of_it)
+
+    def _camera(self, aspect: float, all_of_it: bool = True) -> tuple[F64, F64]:
+        """Return position and what is looked at (3,) [m]: the work space fills what the panel leaves of a window.
+
+        aspect: width of the window over its height.
+        """
+        if self.body is not None:
+            whence, reach = FROM, self.body.reach()
+            centre, size = self.body.base[:3, 3] + reach * np.array([0.22, 0.0, 0.33]), SIZE * reach
+        else:
+            whence, goal = ABOVE, self._goal_now if all_of_it and self._goal_now is not None else self._place
+            centre, size = 0.5 * (self._place + goal), BASE_SIZE + 0.5 * float(np.linalg.norm(goal - self._place))
+        beside, below = (0.0, BELOW) if aspect < NARROW else (BESIDE, 0.0)
+        up, across = math.tan(0.5 * FOV), math.tan(0.5 * FOV) * aspect
+        away = size / min(up * (1.0 - below), across * (1.0 - beside))
+        right = np.cross(-whence, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        aside = away * (beside * across * right - below * up * np.cross(right, -whence))
+        return centre + away * whence + aside, centre + aside
 
     def choose(self, shown: Shown) -> None:
         """Show what a viewer wants to see."""
@@ -138,6 +167,11 @@ class Stage:
         elif self.reader.is_base:
             self._base.position = m.place
             self._base.wxyz = (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading))
+        moved = m.goal is not None and (self._goal_now is None or float(np.linalg.norm(m.goal - self._goal_now)) > 1.0)
+        self._place, self._goal_now = m.place, m.goal
+        if moved and self.reader.is_base:  # a new goal: the whole trip is shown
+            for client in self._server.get_clients().values():
+                self.face(client)
         self._tip.position = m.place
         self._goal.visible = m.goal is not None
         if m.goal is not None:
@@ -173,8 +207,8 @@ class Stage:
                 body.vertices,
                 body.faces,
                 color=colour,
-                opacity=0.25 if is_plane else 0.75,
-                side="double",
+                opacity=0.25 if is_plane else None,
+                side="front",
                 flat_shading=thing.shape.get("type") in ("box", "plane", "mesh", "cloud"),
                 cast_shadow=not is_plane,
             )
@@ -186,7 +220,7 @@ class Stage:
                 shell.vertices,
                 shell.faces,
                 color=SHELL,
-                opacity=0.16,
+                opacity=0.06 if thing.shape.get("type") == "plane" else 0.16,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,
@@ -221,18 +255,8 @@ class Stage:
         self._line("/behind", behind, BEHIND, 0.6 * thick)
         if not self.reader.is_base:
             return
-        for x, y in np.round(m.scan[:, :2] / MAP_CELL).astype(int).tolist():
-            self._cells[(x, y)] = self._cells.pop((x, y), None)  # the newest last
-        for old in list(self._cells)[: max(0, len(self._cells) - MAP_MOST)]:
-            del self._cells[old]
-        self._cloud(
-            "/map", np.array([[x * MAP_CELL, y * MAP_CELL, 0.02] for x, y in self._cells]), (150, 150, 160), 0.09
-        )
-        self._cloud("/scan", m.scan, SEEN, 0.12)
-
-    def forget(self) -> None:
-        """Forget what a base has seen: the story begins anew."""
-        self._cells.clear()
+        self._cloud("/map", story.seen.places(), (140, 142, 152), CELL)
+        self._cloud("/scan", m.scan, SEEN, 1.2 * CELL)
 
     def _cloud(self, name: str, points: F64, colour: tuple[int, int, int], size: float) -> None:
         have = self._lines.get(name)
@@ -256,50 +280,6 @@ class Stage:
             have.points, have.visible = pieces, True
         else:
             self._lines[name] = self.scene.add_line_segments(name, pieces, colour, thickness=thick)
-
-
-class Handles:
-    """What can be dragged: the goal and the page's own obstacles."""
-
-    def __init__(self, server: viser.ViserServer, is_base: bool, moved: Callable[[str, F64, bool], None]) -> None:
-        """`moved` is told what was moved where (3,) [m], and whether that was the end of it."""
-        self._scene, self._is_base, self._moved = server.scene, is_base, moved
-        self._have: dict[str, viser.TransformControlsHandle] = {}
-        self.grasped = ""  # what is being dragged
-
-    def put(self, name: str, place: F64) -> None:
-        """Show a handle, or move it: unless somebody has it in his hand."""
-        have = self._have.get(name)
-        if have is not None:
-            if self.grasped != name:
-                have.position = place
-            return
-        axes = (True, True, not self._is_base)
-        handle = self._scene.add_transform_controls(
-            f"/handles/{name}",
-            0.9 if self._is_base else 0.16,
-            active_axes=axes,
-            disable_rotations=True,
-            depth_test=False,
-            position=place,
-        )
-
-        @handle.on_update
-        def _(event: viser.TransformControlsEvent) -> None:
-            self.grasped = "" if event.phase == "end" else name
-            self._moved(name, np.array(event.target.position, np.float64), event.phase == "end")
-
-        self._have[name] = handle
-
-    def remove(self, name: str) -> None:
-        """Take a handle away."""
-        handle = self._have.pop(name, None)
-        if handle is not None:
-            handle.remove()
-
-    def names(self) -> list[str]:
-        """Return what has a handle."""
-        return list(self._have)
 
 
 def _turned(wxyz: list[float], by: F64) -> tuple[float, float, float, float]:
