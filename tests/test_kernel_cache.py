@@ -92,10 +92,15 @@ def test_old_versions_are_let_go(lab: Path) -> None:
 
 
 def test_a_folder_that_another_process_lets_go_of_meanwhile_is_made_again(lab: Path) -> None:
-    """The other's part is played at the worst moment: between the lock of a function and the save of its kernel."""
+    """The other's part is played at the worst moment: when numba has seen to the folder and is about to write."""
     pruned = (
-        "import shutil\nfrom rtctl.kernel.cache import KernelCache\ntake = KernelCache._take\n"
-        "KernelCache._take = lambda self: (take(self), shutil.rmtree(self._impl.locator.path))\n"
+        "import shutil\nfrom numba.core.caching import IndexDataCacheFile as File\nsave, seen = File.save, set()\n"
+        "def pruned(self, *what):\n"
+        "    if self._index_path not in seen:\n"
+        "        seen.add(self._index_path)\n"
+        "        shutil.rmtree(self._cache_path)\n"
+        "    save(self, *what)\n"
+        "File.save = pruned\n"
     )
     env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     env |= {"PYTHONPATH": f"{lab.parent}:{ROOT}", "XDG_CACHE_HOME": str(lab.parent / "cache")}
