@@ -171,6 +171,14 @@ class ObstacleEdit(NamedTuple):
     feed: bool = False  # somebody keeps observing it: the observation grows stale even of what rests
 
 
+class Advice(NamedTuple):
+    """What is found beside the servo about the goal that is pursued: a posture, and how it is meant."""
+
+    posture: F64  # (n,) [rad]
+    leads: bool = False  # the joints head for it, for a while; else the null space does, on the tip's way to the goal
+    clear: bool = False  # the links in it are known to keep the clearance, even where their points do not
+
+
 class Payload(NamedTuple):
     """What the tip carries, a point in its frame."""
 
@@ -195,6 +203,7 @@ class Request(NamedTuple):
     goal: Goal | None = None
     obstacles: tuple[ObstacleEdit, ...] = ()
     payload: Payload | None = None
+    advice: Advice | None = None
     grip: Grip | None = None
 
 

@@ -51,6 +51,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
             np.zeros(7),
             False,
             np.zeros(7),
+            law.nothing_ahead(arm),
         ),
     )
 
@@ -113,7 +114,7 @@ def pushed_out_at_every_depth() -> bool:
 
 def test_penetration_pushes_out(monkeypatch: Patch):
     assert pushed_out_at_every_depth()
-    true_field = law.field
+    true_field = law.field_to
 
     def flipping(*arguments: Any) -> int:
         flags, seen = true_field(*arguments), arguments[5]
@@ -123,7 +124,7 @@ def test_penetration_pushes_out(monkeypatch: Patch):
 
     interpreted(monkeypatch)
     assert pushed_out_at_every_depth()
-    monkeypatch.setattr(law, "field", flipping)
+    monkeypatch.setattr(law, "field_to", flipping)
     assert not pushed_out_at_every_depth()
 
 
@@ -139,7 +140,7 @@ def push_depends_on_the_gap_alone() -> bool:
         at = np.array([[radius + 0.04, 0.0, 0.0]])
         eye = np.eye(3).reshape(1, 3, 3)
         points = law.MovingPoints(at, eye, eye, np.zeros(1), np.ones(1, np.int64))
-        law.field(points, ZERO, ZERO, table, p, out, True, True)
+        law.field_to(points, ZERO, ZERO, table, p, out, True, True, law.nothing_ahead(robot()).ends)
         forces.append(out.tau[0])
     wanted = p.eta * (1.0 / 0.04 - 1.0 / p.rho0) / 0.04**2
     return bool(np.allclose(forces, wanted, rtol=1e-9))
@@ -147,14 +148,14 @@ def push_depends_on_the_gap_alone() -> bool:
 
 def test_the_gradient_of_the_distance_is_a_unit_vector(monkeypatch: Patch):
     assert push_depends_on_the_gap_alone()
-    true_field = law.field
+    true_field = law.field_to
 
     def unnormalised(points: law.MovingPoints, *arguments: Any) -> int:
         flags, seen = true_field(points, *arguments), arguments[4]
         seen.tau[:] *= np.linalg.norm(points.P[0])  # p - centre instead of its direction
         return int(flags)
 
-    monkeypatch.setattr(law, "field", unnormalised)
+    monkeypatch.setattr(law, "field_to", unnormalised)
     assert not push_depends_on_the_gap_alone()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from rtctl.arm.bounds import SPEED_HORIZON
 from rtctl.arm.field import MovingPoints, move_points
-from rtctl.arm.law import Law, Motion, evaluate_law
+from rtctl.arm.law import Law, Motion, evaluate_law, nothing_ahead
 from rtctl.arm.model import Model
 from rtctl.arm.osc import Twist, operational_space
 from rtctl.types import F64, Shape
@@ -54,7 +54,8 @@ def law_at(q: F64, qd: F64 | None = None, balls: tuple[tuple[float, ...], ...] =
     obstacles = changes.pop("obstacles", space_of(balls))
     still = Twist(ZERO, ZERO)
     error, previous = Twist(changes.pop("e", ZERO), ZERO), Twist(changes.pop("v_ref", ZERO), ZERO)
-    motion = Motion(q, qd, Twist(twist[:3], twist[3:]), still, still, q, 1.0, np.zeros(7), False, np.zeros(7))
+    plain = (still, still, q, 1.0, np.zeros(7), False, np.zeros(7), nothing_ahead(arm))
+    motion = Motion(q, qd, Twist(twist[:3], twist[3:]), *plain)
     return evaluate_law(arm, model, space, obstacles, motion._replace(error=error, previous=previous, **changes))
 
 

@@ -48,6 +48,7 @@ qd_max_rad_s = 20.0
 tau_max_Nm = 50.0
 tau_rate_Nm_s = 1000.0
 drive = "DM8009"
+brake = true
 armature_kg_m2 = {armature}
 [loop]
 servo_hz = {hz}

@@ -180,7 +180,8 @@ def test_planar4_s_inertia_is_that_of_slender_rods():
 @pytest.mark.parametrize("name", NAMES)
 def test_check_has_no_more_to_say_than_that_a_simulation_is_not_real_time(name: str):
     found = report(cfg.load(config_of(name)), arm(name))
-    assert [row.name for row in found.rows if row.verdict == "warn"] == ["servo period"]
+    odd = ["inertia of link_3"] if name == "puma560" else []  # as published: no body has it
+    assert [row.name for row in found.rows if row.verdict == "warn"] == ["servo period", *odd]
     assert arm(name).coverage.fraction == 1.0
     assert len(arm(name).points.radius) < 110
 

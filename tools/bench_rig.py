@@ -15,7 +15,7 @@ import numpy as np
 from rtctl import design as cfg
 from rtctl.app.arm_link import link_spec
 from rtctl.arm import bounds, least_change, nearby, osc, scaling
-from rtctl.arm.law import Motion, prepared
+from rtctl.arm.law import Motion, nothing_ahead, prepared
 from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace, Twist, operational_space
@@ -212,6 +212,7 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         np.zeros(robot.n),
         False,
         np.zeros(robot.n),
+        nothing_ahead(robot),
     )
     return Case(small, model, space, obstacles, motion)
 
@@ -262,7 +263,7 @@ class BoundFloor:
     def __init__(self, library: ctypes.CDLL, case: Case) -> None:
         self._library = library
         r, model, space, obstacles, motion = case
-        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd, _, _ = motion
+        q, qd, (xd, omega), (e, e_rot), (v_ref, w_ref), q_rest, _, qdd, *_ = motion
         p, a, b = r.motion, r.avoid, r.limit
         self._arrays = [
             np.ascontiguousarray(each, np.float64)

@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 
 from rtctl import design as cfg
+from rtctl.app import guide
+from rtctl.app.adviser import Adviser, Inline
 from rtctl.app.arm_link import ArmLink, link_spec, open_link
 from rtctl.app.arm_log import decoded, header_of, rebuild
 from rtctl.app.arm_scene import ArmPlay, scenario_robot
@@ -176,6 +178,11 @@ def gripper_events(robot: Robot, before: Memory, after: Memory) -> list[Event]:
     return found
 
 
+def _warm(robot: Robot) -> None:
+    warm(robot)
+    guide.warm(robot)
+
+
 def misplaced(robot: Robot, m: Memory, edit: ObstacleEdit) -> str:
     """Return why an obstacle cannot be where a person says, '' where it can: nothing that is real lies inside the arm.
 
@@ -242,7 +249,7 @@ ARM = Vehicle(
     rx=CAN_RX,
     tx=CAN_TX,
     load=load,
-    warm=warm,
+    warm=_warm,
     bounds=lambda robot, link: Bounds(
         tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
     ),
@@ -253,6 +260,7 @@ ARM = Vehicle(
     events=events,
     names=faults.names,
     status=status,
+    adviser=lambda robot, lockstep: Inline(robot) if lockstep else Adviser(robot),
     misplaced=misplaced,
     fallback=fallback,
     farewell=farewell,

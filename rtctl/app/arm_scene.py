@@ -6,19 +6,20 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rtctl.app.stream import ArmStatus, GoalStream
+from rtctl.app.guide import Guide, seen_of
 from rtctl.app.tally import Leg, kept, number, of_way
 from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.design.assets import load_assets
-from rtctl.errors import ConfigError, PlanError
+from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of, quat_of
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, goal_of
 from rtctl.types import (
     F64,
+    Advice,
     Command,
     Drive,
     Feedback,
@@ -32,8 +33,6 @@ from rtctl.types import (
     Truth,
     Verb,
 )
-from rtctl.world import obstacle_table
-from rtctl.world.obstacle_table import World
 
 ArmTurn: TypeAlias = Turn[Feedback, Command]
 CAMERA_HZ = 50.0  # rate at which moving obstacles are reported to the controller
@@ -100,23 +99,26 @@ def _advanced(leg: Leg, truth: Truth) -> Leg:
 class ArmFeed:
     """What the controller is told and when: arming, the scenario's goals, and a camera's view of its obstacles."""
 
-    def __init__(self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: ArmTally) -> None:
+    def __init__(
+        self, robot: Robot, scenario: Scenario, simulator: Simulator, tally: ArmTally, guide: Guide | None = None
+    ) -> None:
+        """`guide` advises; without one the law is alone, unless the scenario asks for a plan of each goal."""
         self.robot, self.simulator, self.tally = robot, simulator, tally
         self.pending = list(scenario.goal)
         self.grips = sorted(scenario.grip, key=lambda g: g.at_s)
         self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its refusal not yet seen
         self.last: dict[str, Shape | None] = {}
         self.frames = 0
-        self.planned, self.seed = scenario.planner, scenario.seed
-        self.world: World = obstacle_table.empty(robot.slots, robot.meshes)  # as the controller knows it now
-        self.stream: GoalStream | None = None
-        self.events: list[tuple[float, str, str]] = []  # of the planner; (time [s], name, detail)
+        planned = Guide(robot, True, scenario.seed, at_once=True) if scenario.planner else guide
+        self.guide: Guide | None = planned
+        self.events: list[tuple[float, str, str]] = []  # of the guide; (time [s], name, detail)
 
     def request(self, m: Memory, truth: Truth) -> Request:
         """Return the request of this period."""
-        self.world = m.world
         if self.waiting is not None and not m.refusal:
             self.tally.legs.append(Leg(*self.waiting))
+            if self.guide is not None:
+                self.guide.begin()
         self.waiting = None
         verb = Verb.NONE
         if m.state == State.IDLE and m.tick < 0:
@@ -127,11 +129,8 @@ class ArmFeed:
             goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
             goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
             self.waiting = (goal, truth.time, truth.tip.copy())
-            if self.planned:
-                goal = self._first(goal, m, truth)
-        elif self.stream is not None and m.state == State.RUN:
-            goal = self._next(self.stream, m, truth)
-        return Request(verb, goal, self._seen(truth), grip=self._grip(m, truth))
+            return Request(verb, goal, self._seen(truth), grip=self._grip(m, truth))
+        return Request(verb, None, self._seen(truth), advice=self._advice(m, truth), grip=self._grip(m, truth))
 
     def _grip(self, m: Memory, truth: Truth) -> Grip | None:
         """Return what grippers are asked now; what is due before the arm runs waits."""
@@ -140,30 +139,13 @@ class ArmFeed:
         asked = self.grips.pop(0)
         return Grip(asked.closed, asked.force_N)
 
-    def _first(self, goal: Goal, m: Memory, truth: Truth) -> Goal:
-        """Return the first sub-goal on the way to `goal`, or that itself where there is no plan."""
-        from rtctl.app.plan import plan  # heavy, and few scenarios plan
-
-        try:
-            self.stream = GoalStream(
-                # bounded by what it looks at alone: a slow machine must not find another way
-                lambda q, seed: plan(self.robot, q, goal, self.world.obstacles, seed, within=np.inf),
-                m.joints.q,
-                self.seed,
-            )
-        except PlanError as error:
-            self.stream = None
-            self.events.append((truth.time, "no_plan", str(error)))
-            return goal
-        return self._next(self.stream, m, truth) or goal
-
-    def _next(self, stream: GoalStream, m: Memory, truth: Truth) -> Goal | None:
-        goal = stream.next(ArmStatus(m.status.name.lower(), "; ".join(m.blocked_by), m.tip.x, m.joints.q))
-        self.events += [(truth.time, "planned", text) for text in stream.events]
-        stream.events.clear()
-        if stream.over:
-            self.stream = None
-        return goal
+    def _advice(self, m: Memory, truth: Truth) -> Advice | None:
+        if self.guide is None or not self.guide.due(m.tick):
+            return None
+        advice = self.guide.advise(seen_of(m))
+        self.events += [(truth.time, name, text) for name, text in self.guide.events]
+        self.guide.events.clear()
+        return advice
 
     def _seen(self, truth: Truth) -> tuple[ObstacleEdit, ...]:
         """Return what a camera reports: everything at first, then at its rate what moves, appears or is gone."""
@@ -203,7 +185,7 @@ class ArmPlay:
         """`link` ends in the simulator; `robot` knows the scenario's meshes, see `scenario_robot`."""
         self.robot, self.link, self.simulator = robot, link, simulator
         self.tally = ArmTally(robot)
-        self.feed = ArmFeed(robot, scenario, simulator, self.tally)
+        self.feed = ArmFeed(robot, scenario, simulator, self.tally, Guide(robot, robot.plans, scenario.seed))
         self.truth: Truth = simulator.truth()
 
     @property

@@ -15,7 +15,7 @@ import numpy as np
 from rtctl.app.choose import vehicle_of
 from rtctl.app.queue import GoalQueue
 from rtctl.app.servo import Servo
-from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, C, F, Loop, M, R, Say, Setup, Vehicle
+from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, Advising, C, F, Loop, M, R, Say, Setup, Vehicle
 from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
 from rtctl.hal import clock
 from rtctl.hal.client import default_path
@@ -105,6 +105,7 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         told = {**header.extra, **surroundings(setup.loop.realtime, link.counters, dry)}
         listener = lobby.hand_over()  # before the recorder: it is a process of its own
         console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link), listener=listener)))
+        adviser = stack.enter_context(closing(vehicle.adviser(robot, lockstep)))  # a fork: the thread has ended
         recorder = _recorder(setup.log, header._replace(extra=told), how.path)
         servo = Servo(vehicle, robot, link, recorder, start, dry)
         queue = GoalQueue()
@@ -119,7 +120,7 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         service.ready(f"{robot.name}: IDLE")
         say(f"rtctl: ready, log {recorder.stats().path}")
         link.settle()
-        process = Process(servo, console, service, recorder, signals, queue, lockstep)
+        process = Process(servo, console, service, recorder, signals, queue, adviser, lockstep)
         code, failure = EXIT_FAILED, None
         slots = clock.lockstep() if lockstep else clock.grid(robot.dt)
         try:
@@ -188,12 +189,13 @@ class Process(NamedTuple, Generic[R, M, F, C]):
     recorder: Recorder
     signals: Signals
     queue: GoalQueue
+    adviser: Advising[M]
     lockstep: bool
 
 
 def _loop(process: Process[R, M, F, C], slots: Iterator[Slot]) -> int:
     """Turn until the supervisor says that the daemon may leave; return the exit code."""
-    servo, console, service, recorder, signals, queue, lockstep = process
+    servo, console, service, recorder, signals, queue, adviser, lockstep = process
     every = max(1, round(REVIEW / servo.robot.dt))
     told, heard = 0, True
     for slot in slots:
@@ -202,7 +204,14 @@ def _loop(process: Process[R, M, F, C], slots: Iterator[Slot]) -> int:
             request = request._replace(verb=Verb.TERM)
             service.stopping()
         request, put_aside = queue.passed(request, servo.memory.state)
+        if request.verb == Verb.NONE and request.goal is None:  # else next time: it stays in the socket
+            advice = adviser.advise(servo.memory)
+            request = request if advice is None else request._replace(advice=advice)
+            servo.notes += adviser.events
+            adviser.events.clear()
         servo.turn(slot, request)
+        if request.goal is not None and not servo.memory.refusal:
+            adviser.begin()
         queue.judged(servo.memory.refusal)
         console.answer(not servo.memory.refusal, servo.memory.refusal or put_aside)
         recorder.beat(time.monotonic_ns())

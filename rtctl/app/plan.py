@@ -1,62 +1,45 @@
-"""The global planner: a far goal into a stream of sub-goals for the same goal interface (OMPL, joint space).
+"""The global planner: a far goal into a way of postures, or a stream of sub-goals for the goal interface (OMPL).
 
 RRT-Connect over the joints; a posture is free when every point subjected to the potential keeps a clearance from every
 obstacle, no two links come near, and no joint enters its limit zone. The clearance begins at the field's influence, so
 that a planned path feels no repulsion at all, and is relaxed in steps where there is no room for that; near the start
-and the goal it falls to what these have. Seeded: equal inputs give equal paths.
+and the goal it falls to what these have. Edges are tested by one compiled call each. Seeded: equal inputs give equal
+paths.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from ompl import base, geometric, util
 
+from rtctl.app.postures import Ending, Site, along, endings, site_of
+from rtctl.arm.freedom import Body, Room, body_of, first_blocked
+from rtctl.arm.kinematics import clearance_of
 from rtctl.arm.model import Model
 from rtctl.arm.robot import Robot
-from rtctl.arm.task import selection, task_error
 from rtctl.arm.task import within as able
+from rtctl.design.report import WAY_ROOM
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Goal, Task
-from rtctl.world.primitives import Obstacles, distances
+from rtctl.world.primitives import Obstacles
 
-ROOM = (1.0, 0.65, 0.4)  # fractions of influence and limit zone that a path keeps, tried in this order
+ROOM = (1.0, 0.65, 0.4, 0.25)  # fractions of influence and limit zone that a path keeps, tried in this order
 EDGE = 0.06  # [rad] between two checked postures of an edge
 FINE = 0.015  # [rad] between those of the finished path
 BETWEEN = 0.8  # fraction of the room that a finished path has between the postures of its edges
-RELAX = 0.3  # [m/rad] by which the clearance grows from that of start or goal
-CHECKS = 30_000  # postures looked at, a step of ROOM
+CHECKS = 1500  # edges looked at, a step of ROOM
 WITHIN = 60.0  # [s]; a plan that takes longer depends on the machine
-SEEDS = 60  # random starts of the inverse kinematics
-NEAREST = 0.8  # of the field's clearance that a goal posture must have
-ENDS = 8  # goal postures offered to the planner
-REACHED = 1e-4  # [m], and ten times that [rad], of the inverse kinematics
+NEAREST = 0.8  # of the field's clearance that a goal posture should have
 THERE = 0.01  # [m] tolerance of a sub-goal, which is passed long before
 SPACING = 0.08  # [m] between sub-goals at most
 TURN = 0.35  # [rad] that a joint, and the hand, may turn between sub-goals
 CORRIDOR = 0.008  # [m] that the straight line between sub-goals may leave the planned path
 STRETCH = 1.0  # [rad] longest edge of the tree
-
-
-class Site(NamedTuple):
-    """What a plan is made in."""
-
-    robot: Robot
-    obstacles: Obstacles
-    start: F64  # (n,) [rad]
-
-
-class Room(NamedTuple):
-    """What a posture must keep free of."""
-
-    rho: float  # [m] to obstacles
-    own: float  # [m] between links
-    low: F64  # (n,) [rad]
-    high: F64  # (n,) [rad]
+FAR = 10.0  # [m] of a clearance that nothing bounds
 
 
 def plan(
@@ -64,14 +47,14 @@ def plan(
 ) -> list[Goal]:
     """Return sub-goals that lead the arm from posture q (n,) [rad] to `goal`; the last one is `goal` itself.
 
-    Each carries the posture it was planned with. The same `seed` gives the same path; `checks` bounds the postures
-    looked at, a step of ROOM, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
+    Each carries the posture it was planned with. The same `seed` gives the same path; `checks` bounds the edges looked
+    at, a step of ROOM, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
     """
     task, why = able(goal.task, robot.axes)
     if why:
         raise PlanError(f"plan: {why}")
     goal = goal._replace(task=task)
-    path = plan_joints(Site(robot, obstacles, np.array(q, np.float64)), goal, seed, checks, within)
+    path = plan_joints(site_of(robot, obstacles, q), goal, seed, checks, within)
     return sub_goals(robot, path, goal)
 
 
@@ -84,17 +67,16 @@ def plan_joints(site: Site, goal: Goal, seed: int, checks: int = CHECKS, within:
     end, why = time.monotonic() + within, ""
     util.noOutputHandler()
     for share in ROOM:
-        room = _room(site, share)
-        ends, why = _goal_postures(site, goal, room, rng)
-        free = _Free(site, room, ends)
-        path = _searched(site, room, ends, free, seed, partial(_spent, free, checks, end))
+        ends, why = _goal_postures(site, goal, share, seed)
+        free = _Free(site, share, ends)
+        path = _searched(site, ends, free, seed, partial(_spent, free, checks, end))
         if path is not None:
             path = _shortened(path, free, rng)
             if free.along(path, FINE, BETWEEN):
                 return path
         if time.monotonic() > end:
             raise PlanError(f"plan: no path to {_text(goal)} found in {within:g} s")
-    raise PlanError(why or f"plan: no path to {_text(goal)} found in {checks} postures a try")
+    raise PlanError(why or f"plan: no path to {_text(goal)} found in {checks} edges a try")
 
 
 def sub_goals(robot: Robot, path: F64, goal: Goal) -> list[Goal]:
@@ -129,53 +111,43 @@ def _may_skip(poses: list[Model], fine: F64, a: int, b: int) -> bool:
 def _nearness(site: Site, q: F64) -> tuple[float, float]:
     """Return the least distance [m] of the arm to obstacles, and to itself, at q (n,)."""
     robot = site.robot
-    rho, _ = distances(robot.body.placed(q, robot.points), robot.points.radius, site.obstacles)
     own = robot.body.own_distances(q, robot.own)
-    return float(rho.min()), float(own.min()) if len(own) else np.inf
-
-
-def _room(site: Site, share: float) -> Room:
-    """Return what a path keeps free of: a share of influences and zones, never less than the clearances."""
-    r, q = site.robot, site.start
-    zone = np.maximum(share * r.limit.rho0, r.limit.rho_min)
-    return Room(
-        max(share * r.avoid.rho0, 1.2 * r.avoid.rho_min),
-        max(share * r.self_avoid.rho0, r.self_avoid.rho_min),
-        np.minimum(r.q_min + zone, q),
-        np.maximum(r.q_max - zone, q),
-    )
+    rho = float(clearance_of(site.chain, robot.points, q[None], site.obstacles)[0])
+    return min(rho, FAR), min(float(own.min()), FAR) if len(own) else FAR
 
 
 class _Free:
-    """Whether a posture is free; counts how often it was asked."""
+    """Whether postures and edges keep a share of the influences and zones, never less than the clearances."""
 
-    def __init__(self, site: Site, room: Room, ends: list[F64]) -> None:
-        self.site, self.room, self.asked = site, room, 0
-        self.anchors = np.array([site.start, *ends])
-        self.near = np.array([_nearness(site, q) for q in self.anchors])
+    def __init__(self, site: Site, share: float, ends: list[F64]) -> None:
+        r, q = site.robot, site.start
+        zone = np.maximum(share * r.limit.rho0, 1.5 * r.limit.rho_min)
+        anchors = np.array([q, *ends])
+        self.low = np.minimum(r.q_min + zone, anchors.min(axis=0))
+        self.high = np.maximum(r.q_max - zone, anchors.max(axis=0))
+        self.body: Body = body_of(r)
+        self.obstacles, self.asked = site.obstacles, 0
+        self.room = Room(
+            max(share * r.avoid.rho0, WAY_ROOM * r.avoid.rho_min),
+            max(share * r.self_avoid.rho0, r.self_avoid.rho_min),
+            anchors,
+            np.array([_nearness(site, each) for each in anchors]),
+        )
 
-    def __call__(self, q: F64, share: float = 1.0) -> bool:
-        """Return whether q (n,) keeps a share of the room, relaxed towards what start and ends have."""
+    def all(self, Q: F64, share: float = 1.0) -> bool:
+        """Return whether all postures (b, n) keep a share of the room, relaxed towards what start and ends have."""
         self.asked += 1
-        grown = 0.999 * self.near + RELAX * np.abs(self.anchors - q).max(axis=1)[:, None]
-        robot = self.site.robot
-        rho, _ = distances(robot.body.placed(q, robot.points), robot.points.radius, self.site.obstacles)
-        if rho.min() < share * min(self.room.rho, grown[:, 0].min()):
-            return False
-        own = robot.body.own_distances(q, robot.own)
-        return not len(own) or bool(own.min() >= share * min(self.room.own, grown[:, 1].min()))
+        return first_blocked(self.body, Q, self.obstacles, self.room, share) < 0
 
     def along(self, path: F64, step: float, share: float = 1.0) -> bool:
         """Return whether every posture of a path (k, n), a joint's step [rad] apart at most, is free."""
-        return all(self(q, share) for q in _resampled(path, step))
+        return self.all(_resampled(path, step), share)
 
 
 # -- the search ----------------------------------------------------------------------------------------------------
 
 
-def _searched(
-    site: Site, room: Room, ends: list[F64], free: "_Free", seed: int, stop: Callable[[], bool]
-) -> F64 | None:
+def _searched(site: Site, ends: list[F64], free: _Free, seed: int, stop: Callable[[], bool]) -> F64 | None:
     """Return a path (k, n): a straight edge where one is free, else RRT-Connect's; None when that is stopped first."""
     for q in ends:
         edge = np.array([site.start, q])
@@ -185,9 +157,11 @@ def _searched(
         return None
     util.RNG.setSeed(seed + 1)  # before anything that draws is made
     n = site.robot.n
-    space = _space(room)
+    space = _space(free)
     info = base.SpaceInformation(space)
-    info.setStateValidityChecker(lambda state: free(np.array([state[i] for i in range(n)])))
+    info.setStateValidityChecker(lambda state: free.all(_joints(state, n)[None]))
+    validator = _Edges(info, free, n)
+    info.setMotionValidator(validator)
     info.setup()
     problem = base.ProblemDefinition(info)
     problem.addStartState(_state(space, site.start))
@@ -203,19 +177,35 @@ def _searched(
     if not problem.hasExactSolution():
         return None
     states = problem.getSolutionPath().getStates()
-    return np.array([[state[i] for i in range(n)] for state in states])
+    return np.array([_joints(state, n) for state in states])
 
 
-def _spent(free: "_Free", checks: int, end: float) -> bool:
+class _Edges(base.MotionValidator):  # type: ignore[misc]
+    """Tests an edge of the tree by one compiled call."""
+
+    def __init__(self, info: base.SpaceInformation, free: _Free, n: int) -> None:
+        super().__init__(info)
+        self.free, self.n = free, n
+
+    def checkMotion(self, a: base.State, b: base.State) -> bool:
+        """Return whether the straight line between two states is free."""
+        return self.free.all(along(_joints(a, self.n), _joints(b, self.n), EDGE))
+
+
+def _spent(free: _Free, checks: int, end: float) -> bool:
     return free.asked > checks or time.monotonic() > end
 
 
-def _space(room: Room) -> base.RealVectorStateSpace:
-    n = len(room.low)
+def _joints(state: base.State, n: int) -> F64:
+    return np.array([state[i] for i in range(n)])
+
+
+def _space(free: _Free) -> base.RealVectorStateSpace:
+    n = len(free.low)
     space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
     for i in range(n):
-        bounds.setLow(i, float(room.low[i]) - 1e-9)
-        bounds.setHigh(i, float(room.high[i]) + 1e-9)
+        bounds.setLow(i, float(free.low[i]) - 1e-9)
+        bounds.setHigh(i, float(free.high[i]) + 1e-9)
     space.setBounds(bounds)
     space.setLongestValidSegmentFraction(EDGE / space.getMaximumExtent())
     return space
@@ -237,7 +227,7 @@ def _shortened(path: F64, free: _Free, rng: np.random.Generator, tries: int = 15
         a, b = sorted(rng.integers(0, len(fine), 2).tolist())
         if b - a < 2:
             continue
-        if free.along(np.array([fine[a], fine[b]]), EDGE):
+        if free.all(along(fine[a], fine[b], EDGE)):
             path = np.concatenate([fine[: a + 1], fine[b:]])
     return path
 
@@ -254,50 +244,19 @@ def _resampled(path: F64, step: float) -> F64:
 # -- postures that have the goal -------------------------------------------------------------------------------------
 
 
-def _goal_postures(site: Site, goal: Goal, room: Room, rng: np.random.Generator) -> tuple[list[F64], str]:
+def _goal_postures(site: Site, goal: Goal, share: float, seed: int) -> tuple[list[F64], str]:
     """Return free postures that have the goal, the best first, and why there are none ('' when there are).
 
-    Good is near the start and far from obstacles: past the influence a goal casts no shadow.
+    Those with a clearance to spare come alone, where there are some.
     """
-    robot = site.robot
-    found: list[tuple[float, F64]] = []
-    solved = 0
-    for q0 in _seeds(site, rng):
-        q = _inverse(robot, q0, goal, room)
-        if q is None:
-            continue
-        solved += 1
-        rho, own = _nearness(site, q)
-        new = all(np.abs(q - other).max() > 0.1 for _, other in found)
-        if new and rho >= NEAREST * robot.avoid.rho_min and own >= robot.self_avoid.rho_min:
-            found.append((float(np.abs(q - site.start).max()) - 3.0 * min(rho / robot.avoid.rho0, 1.0), q))
-    if not solved:
-        return [], f"plan: no posture within the joint limits was found that has the goal {_text(goal)}"
+    found: list[Ending] = endings(site, goal, seed, share)
     if not found:
-        return [], f"plan: every posture found that has the goal {_text(goal)} touches something"
-    return [q for _, q in sorted(found, key=lambda pair: pair[0])][:ENDS], ""
-
-
-def _seeds(site: Site, rng: np.random.Generator) -> Iterator[F64]:
-    yield site.start
-    yield site.robot.home
-    for _ in range(SEEDS):
-        yield rng.uniform(site.robot.q_min, site.robot.q_max)
-
-
-def _inverse(robot: Robot, q: F64, goal: Goal, room: Room) -> F64 | None:
-    """Return a posture that has the goal, by damped least squares from q; None when that ends elsewhere."""
-    q = np.clip(q, room.low, room.high)
-    for _ in range(80):
-        m = _evaluated(robot, q)
-        e, e_rot = task_error(int(goal.task), goal.axis, goal.position, goal.wxyz, m.x, m.R)
-        if np.linalg.norm(e) < REACHED and np.linalg.norm(e_rot) < 10.0 * REACHED:
-            return q
-        S = selection(int(goal.task), goal.axis, m.R)
-        J = S @ m.J
-        step = J.T @ np.linalg.solve(J @ J.T + 1e-4 * np.eye(len(S)), S @ np.concatenate([e, e_rot]))
-        q = np.clip(q + step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-9)), room.low, room.high)
-    return None
+        nothing = site.obstacles._replace(active=np.zeros_like(site.obstacles.active))
+        if endings(site._replace(obstacles=nothing), goal, seed, 0.0):
+            return [], f"plan: every posture found that has the goal {_text(goal)} touches something"
+        return [], f"plan: no posture within the joint limits was found that has the goal {_text(goal)}"
+    fine = [e.q for e in found if e.rho >= NEAREST * site.robot.avoid.rho_min]
+    return fine or [e.q for e in found], ""
 
 
 def _evaluated(robot: Robot, q: F64) -> Model:

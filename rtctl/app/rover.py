@@ -12,7 +12,7 @@ import numpy as np
 from rtctl.app.rover_link import RoverLink, open_link
 from rtctl.app.rover_log import header_of, rebuild
 from rtctl.app.rover_scene import open_play
-from rtctl.app.vehicle import Event, Link, Said, Setup, Sink, Vehicle, clearances
+from rtctl.app.vehicle import Event, Link, Said, Setup, Silent, Sink, Vehicle, clearances
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
 from rtctl.hal.messages import Bounds
@@ -202,6 +202,7 @@ ROVER = Vehicle(
     events=events,
     names=faults.names,
     status=status,
+    adviser=lambda base, lockstep: Silent(),
     misplaced=lambda base, memory, edit: "",  # what is beside a base it sees for itself
     fallback=fallback,
     farewell=farewell,

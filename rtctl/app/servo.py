@@ -43,6 +43,7 @@ class Servo(Generic[R, M, F, C]):
         self.faults_seen = 0
         self.compute = 0.0  # [s] of the previous turn
         self.repeats = Repeats()
+        self.notes: list[Event] = []  # of others in this process, for the next turn to tell
         self.events: list[Said] = []  # newest last; (time [s], name, detail)
         self.lateness = 0.0  # [s] of this wake-up
         self.flags = 0  # types.Link bits that only the daemon knows
@@ -65,6 +66,9 @@ class Servo(Generic[R, M, F, C]):
         if link.said:
             events += [("vehicle", text) for text in link.said]
             link.said.clear()
+        if self.notes:
+            events += self.notes
+            self.notes.clear()
         events = self.repeats.passed(now, events)
         self.events += [(now, name, detail) for name, detail in events]
         self._log(record, frames, request, events)

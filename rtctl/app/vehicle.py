@@ -20,7 +20,7 @@ from rtctl.log.read.topic import Structured
 from rtctl.plain import Json
 from rtctl.spec.robot import ConsoleTable, LogTable
 from rtctl.spec.scenario import Scenario
-from rtctl.types import F64, ObstacleEdit, Record, Request, State, Status
+from rtctl.types import F64, Advice, ObstacleEdit, Record, Request, State, Status
 from rtctl.world.obstacle_table import World
 
 Say: TypeAlias = Callable[[str], None]
@@ -111,6 +111,33 @@ class Link(Protocol[F_co, C_contra]):
     def close(self) -> None: ...
 
 
+class Advising(Protocol[M_contra]):
+    """Whoever looks beside the servo for what a goal needs."""
+
+    events: list[Event]  # to be told; whoever does takes them out
+
+    def begin(self) -> None: ...  # a goal was taken
+    def advise(self, memory: M_contra) -> Advice | None: ...  # never waits
+    def close(self) -> None: ...
+
+
+class Silent:
+    """Nobody: no advice."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def begin(self) -> None:
+        """Do nothing."""
+
+    def advise(self, memory: object) -> Advice | None:
+        """Return None."""
+        return None
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
 class Turn(NamedTuple, Generic[F, C]):
     """What one turn of the loop did."""
 
@@ -199,6 +226,7 @@ class Vehicle(NamedTuple, Generic[R, M, F, C]):
     events: Callable[[R, M, M, F], list[Event]]  # what changed from a memory to the next
     names: Callable[[int], tuple[str, ...]]  # of faults
     status: Callable[[R, M, Link[F, C], Sequence[Said]], Json]  # what `rtctl status` shows beside what all have
+    adviser: Callable[[R, bool], Advising[M]]  # started; bool: in lockstep
     misplaced: Callable[[R, M, ObstacleEdit], str]  # why an obstacle cannot be where a person says, '' where it can
     fallback: Callable[[R, M, Link[F, C], Sink, Iterator[Slot], bool], None]  # a turn raised; bool: in lockstep
     farewell: Callable[[R, M, Link[F, C], Sink], None]  # the last frames

@@ -51,6 +51,9 @@ __all__ = [
 ]
 
 
+APART = 0.5  # of the way to its place in the goal's posture, by which a point's influences are wider than there
+LEAST_REACH = 1.05  # of the clearance, or of what takes its place: influence is never less
+
 # Rows of Field.points and Field.pairs.
 _P, _V, _B, _F = 0, 3, 6, 12
 RHO, NORMAL, ACCELERATION, FORCE = 0, 1, 4, 5
@@ -64,6 +67,28 @@ class MovingPoints(NamedTuple):
     B: F64  # (m, 3, 3) [1/kg] mobility, Jp A^-1 Jp^T
     radius: F64  # (m,) [m]
     link: I64  # (m,) in 0..n
+
+
+class Ends(NamedTuple):
+    """Where the points are in a posture that has the goal; without one both are empty."""
+
+    P: F64  # (m, 3) [m]
+    rho: F64  # (K, m) [m] from each obstacle there
+    least: float  # [m] below which no influence shrinks
+
+
+@leaf_kernel
+def _reach(ends: Ends, k: int, j: int, points: F64, params: FieldParams) -> float:
+    """Return the influence [m] of the obstacle in slot k on point j: at the goal the clearance that it has there.
+
+    The field then vanishes in the goal's posture, which is the minimum of the whole potential (goals non-reachable with
+    obstacles nearby: Ge and Cui 2000). Away from it influence grows by less than the distance: a point beside its place
+    is not pushed about it, |e| away at the same height it feels APART |e| at most.
+    """
+    x, y, z = points[_P, j] - ends.P[j, 0], points[_P + 1, j] - ends.P[j, 1], points[_P + 2, j] - ends.P[j, 2]
+    reach = ends.rho[k, j] + APART * math.sqrt(x * x + y * y + z * z)
+    bounded: float = min(max(reach, ends.least), params.rho0)
+    return bounded
 
 
 @leaf_kernel
@@ -98,9 +123,10 @@ def _load(B: F64, X: F64) -> None:
 
 # error_model: see firas; the divisor here is at least 1/m_max.
 @leaf_kernel
-def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field) -> None:
+def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: Ends) -> None:
     """Write a and lambda (a + d) of every near point against the obstacle in slot k, zero of the others.
 
+    What moves keeps its whole influence: it will not be where it is now.
     rho_dot = n . (point velocity - surface velocity); the surface point is x = P - rho n, and n . (w x n) = 0.
     """
     p, v, w, points, pairs = obstacles.p, obstacles.v, obstacles.w, out.points, out.pairs
@@ -108,6 +134,8 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field) -> Non
     look_ahead, soft, floor = params.look_ahead, params.v_smooth, 1.0 / params.m_max
     heavy = params.m_max * params.m_max
     px, py, pz, vx, vy, vz, wx, wy, wz = p[k, 0], p[k, 1], p[k, 2], v[k, 0], v[k, 1], v[k, 2], w[k, 0], w[k, 1], w[k, 2]
+    rests = vx == 0.0 and vy == 0.0 and vz == 0.0 and wx == 0.0 and wy == 0.0 and wz == 0.0
+    near_goal = rests and ends.P.shape[0] > 0
     for j in range(points.shape[1]):
         pairs[k, ACCELERATION, j] = 0.0
         pairs[k, FORCE, j] = 0.0
@@ -118,10 +146,11 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field) -> Non
         towards = x * (vx + wy * dz - wz * dy) + y * (vy + wz * dx - wx * dz) + z * (vz + wx * dy - wy * dx)
         rho_dot = x * points[_V, j] + y * points[_V + 1, j] + z * points[_V + 2, j] - towards
         wide = 0.0 if towards <= 0.0 else (0.5 * towards * towards / soft if towards < soft else towards - 0.5 * soft)
-        reach = rho0 + look_ahead * wide
+        reach = _reach(ends, k, j, points, params) if near_goal else rho0 + look_ahead * wide
         if pairs[k, RHO, j] >= reach:
             continue
-        a, d = firas(pairs[k, RHO, j], rho_dot, reach, rho_min, rho_num, eta, k_d)
+        clearance = min(rho_min, reach / LEAST_REACH)
+        a, d = firas(pairs[k, RHO, j], rho_dot, reach, clearance, rho_num, eta, k_d)
         b = x * x * points[_B, j] + y * y * points[_B + 1, j] + z * z * points[_B + 2, j]
         b += 2.0 * (x * y * points[_B + 3, j] + x * z * points[_B + 4, j] + y * z * points[_B + 5, j])
         pairs[k, ACCELERATION, j] = a
@@ -248,11 +277,28 @@ def field(
     blend: bool,
     prefilter: bool,
 ) -> int:
+    """Return `field_to` no posture in particular."""
+    return field_to(points, dq, qd, obstacles, params, out, blend, prefilter, Ends(points.P[:0], out.share[:0], 0.0))
+
+
+@leaf_kernel
+def field_to(
+    points: MovingPoints,
+    dq: F64,
+    qd: F64,
+    obstacles: Obstacles,
+    params: FieldParams,
+    out: Field,
+    blend: bool,
+    prefilter: bool,
+    ends: Ends,
+) -> int:
     """Repulsion of the points from the obstacles; writes all of `out` (Khatib 1986, eq. 18 to 21).
 
     dq: (n,) [rad] since the points were evaluated; qd: (n,).
     blend: per link and obstacle the terms are weighted with a_j / sum a_j, so that a link covered by many spheres
     feels one repulsion; False: the paper's plain sum. prefilter: False measures every pair exactly, to the same bits.
+    ends: influences shrink towards what the points have there, see `_reach`.
     Returns flags CAPPED | CONTACT.
     """
     flags, unions, slots = 0, False, obstacles.active.shape[0]
@@ -266,7 +312,7 @@ def field(
         unions |= out.leader[k] >= 0 and obstacles.group[k] != k
     for k in range(slots):
         if out.leader[k] >= 0:
-            _repel(obstacles, k, params, out)
+            _repel(obstacles, k, params, out, ends)
             if unions:
                 out.leader[k] = _yield_to_nearer(k, slots, obstacles.group, out)
             flags |= _gather(k, points.link, params.rho_num, out)

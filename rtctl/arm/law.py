@@ -13,11 +13,12 @@ from rtctl.arm.bounds import ApproachParams, Bounds, MotionLimits, SelfPairs, jo
 from rtctl.arm.escape import STALL
 from rtctl.arm.field import (
     CAPPED,
+    Ends,
     Field,
     FieldParams,
     LimitParams,
     MovingPoints,
-    field,
+    field_to,
     joint_limit_field,
     self_collision,
 )
@@ -35,6 +36,8 @@ from rtctl.arm.osc import (
     OperationalSpace,
     TaskDynamics,
     Twist,
+    joint_reference,
+    joint_torque,
     motion_torque,
     velocity_reference,
 )
@@ -136,6 +139,15 @@ class Law(NamedTuple):
         return self.row(KEEP)
 
 
+class Ahead(NamedTuple):
+    """What is known of a posture that has the goal."""
+
+    ends: Ends
+    zone: F64  # (n,) [rad or m] in which joint limits push
+    leads: bool  # the joints head for it, not the tip for the goal
+    reference: F64  # (n,) [rad/s] of that; written
+
+
 class Motion(NamedTuple):
     """Where the joints are and what the tip is to do."""
 
@@ -149,6 +161,12 @@ class Motion(NamedTuple):
     qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
     floats: bool  # a hand moves the arm: no motion, no posture
     hand: F64  # (n,) [Nm] then
+    ahead: Ahead
+
+
+def nothing_ahead(robot: Robot) -> Ahead:
+    """Return what is known without a posture of the goal."""
+    return Ahead(Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0), robot.limit.rho0.copy(), False, np.zeros(robot.n))
 
 
 def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles: Obstacles, motion: Motion) -> Law:
@@ -384,6 +402,12 @@ def _torques(
     )
     at = TaskDynamics(model.J, model.Jdqd, model.A, space.Lambda, space.NT)
     motion_torque(at, motion.actual, reference, q, qd, motion.q_rest, p.motion, task[:6], w)
+    ahead = motion.ahead
+    if ahead.leads:
+        for i in range(n):
+            w[_DQ, i] = motion.q_rest[i] - q[i]
+        joint_reference(model.J, w[_DQ], limits.qd_max, p.motion, p.dt, ahead.reference)
+        joint_torque(model.A, qd, ahead.reference, p.motion.k_v, w)
     if motion.floats:
         for i in range(n):
             w[TASK_DRIVE, i], w[TASK_BRAKE, i] = motion.hand[i], 0.0
@@ -392,9 +416,10 @@ def _torques(
         w[_DQ, i], w[_DIAGONAL, i], w[_LOAD, i] = q[i] - model.q[i], model.A[i, i], model.g[i] + model.h[i]
     dq, load, tau_max = w[_DQ], w[_LOAD], limits.tau_max
     points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
-    flags = field(points, dq, qd, obstacles, p.avoid, seen, True, True)
+    flags = field_to(points, dq, qd, obstacles, p.avoid, seen, True, True, ahead.ends)
     rho_self, more = self_collision(model.own_rho, model.own_row, dq, qd, model.A_inv, p.self_collision, w[_SELF])
-    joint_limit_field(q, qd, limits.q_min, limits.q_max, w[_DIAGONAL], p.limit, w[_LIMITS])
+    zones = LimitParams(ahead.zone, p.limit.rho_min, p.limit.rho_num, p.limit.eta, p.limit.k_d)
+    joint_limit_field(q, qd, limits.q_min, limits.q_max, w[_DIAGONAL], zones, w[_LIMITS])
     for i in range(n):
         w[_REPEL, i] = seen.tau[i] + w[_SELF, i]
     repel, push = scale_to_limits(w[_REPEL], load, tau_max), scale_to_limits(w[_LIMITS], load, tau_max)

@@ -21,6 +21,7 @@ from rtctl.types import F64, I64, Goal, Record, RecordRow, Severity, State, Stat
 from rtctl.world.obstacle_table import World
 
 FAULTS_MAX = 64  # bits of a word
+MEASURED_POSTURE = 2  # `has_posture`: the links in it are known to keep the clearance
 _JOINT, _INT, _REAL = (JOINTS_MAX,), "<i8", "<f8"
 
 # One layout whatever the arm: arrays over joints are padded; see `law.prepared`.
@@ -87,8 +88,10 @@ HOT = np.dtype(
             ("goal_tolerance", _REAL),
             ("goal_tolerance_rot", _REAL),
             ("goal_axis", _REAL, (3,)),
-            ("has_posture", _INT),
+            ("has_posture", _INT),  # 0 none, 1 some, MEASURED_POSTURE
             ("goal_posture", _REAL, _JOINT),
+            ("lead_until", _INT),  # tick until which the joints head for that posture
+            ("lead", _REAL, _JOINT),  # [rad/s] reference of that
             ("hold", _REAL, (3,)),  # where the tip stays without a goal
             ("hold_wxyz", _REAL, (4,)),
             ("hold_task", _INT),
@@ -143,7 +146,7 @@ HOT = np.dtype(
     )
 )
 _NAMES = frozenset(HOT.names or ())
-_COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes", "grippers")
+_COLD = ("hot", "n", "refusal", "blocked_by", "model", "parameters", "placed", "table", "shapes", "ends", "grippers")
 _JOINTS = (
     "onset",
     "own_p",
@@ -161,6 +164,7 @@ _JOINTS = (
     "lasting",
     "qd_measured",
     "external_moving",
+    "lead",
     "track",
     "unsure",
     "expected",
@@ -196,7 +200,8 @@ class Memory(msgspec.Struct, frozen=True):
     placed: World  # the obstacles when they were last edited
     table: F64  # where they are now, and how far from arm and goal; see `flat`
     shapes: F64  # what does not change of them between edits
-    grippers: F64  # (4, g) what its grippers remember; see `gripper`
+    ends: F64  # (m, 3) [m] the points in the goal's posture, where there is one
+    grippers: F64  # (9, g) what its grippers remember; see `gripper`
 
     def __getattr__(self, name: str) -> Any:
         """Return a field of the hot record, as the type that it stands for."""
@@ -360,11 +365,11 @@ def _write_goal(h: RecordRow, goal: Goal | None) -> None:
     if goal is None:
         for name in ("goal", "goal_wxyz", "goal_axis", "goal_task", "goal_tolerance", "goal_tolerance_rot"):
             h[name] = 0
-        h["has_posture"], h["goal_posture"] = 0, 0.0
+        h["has_posture"], h["goal_posture"], h["lead_until"] = 0, 0.0, 0
         return
     h["goal"], h["goal_wxyz"], h["goal_axis"] = goal.position, goal.wxyz, goal.axis
     h["goal_task"], h["goal_tolerance"], h["goal_tolerance_rot"] = int(goal.task), goal.tolerance, goal.tolerance_rot
     h["has_posture"] = goal.posture is not None
-    h["goal_posture"] = 0.0
+    h["goal_posture"], h["lead_until"] = 0.0, 0
     if goal.posture is not None:
         h["goal_posture"][: len(goal.posture)] = goal.posture

@@ -13,6 +13,8 @@ from rtctl.kernel import kernel, leaf_kernel
 from rtctl.kernel.linalg import matmul, symmetric_eigen
 from rtctl.types import F64
 
+JOINT_RATE = 4.0  # [1/s] of full speed, at which joints that head for a posture change theirs
+LEAD_TURN = 1.5  # of w_max, that the tool may turn at then: it is not what is asked for, but what comes of it
 SPEED_FLOOR = 0.2  # fraction of qd_max that the null space cannot take from the tip: it never stands still for it
 
 
@@ -181,6 +183,50 @@ def velocity_reference(
             scale = bound / abs(asked)
     _slew(previous.linear, error.linear, v, scale, p.a_max * dt, out.linear)
     _slew(previous.angular, error.angular, w, scale, p.alpha_max * dt, out.angular)
+
+
+@leaf_kernel
+def joint_reference(J: F64, e: F64, qd_max: F64, p: MotionParams, dt: float, reference: F64) -> None:
+    """Move the reference (n,) [rad/s] of joints that head for a posture, e (n,) [rad] away, on by a tick.
+
+    The form of eq. 8 in joint space: straight to it, no joint beyond speed_margin qd_max (n,), nor the tip beyond its
+    own speeds; in units of those speeds, where full speed is reached in 1/JOINT_RATE.
+    """
+    n, away = e.shape[0], 0.0
+    for i in range(n):
+        away = max(away, abs(e[i]) / (p.speed_margin * qd_max[i]))
+    speed = 0.0 if away < 1e-9 else approach_speed(away, p.k_p / p.k_v, 1.0, JOINT_RATE) / away
+    linear = angular = 0.0
+    for r in range(6):
+        s = 0.0
+        for i in range(n):
+            s += J[r, i] * e[i]
+        linear += s * s if r < 3 else 0.0
+        angular += s * s if r > 2 else 0.0
+    if speed * math.sqrt(linear) > p.v_max:
+        speed = p.v_max / math.sqrt(linear)
+    if speed * math.sqrt(angular) > LEAD_TURN * p.w_max:
+        speed = LEAD_TURN * p.w_max / math.sqrt(angular)
+    size = 0.0
+    for i in range(n):
+        d = (e[i] * speed - reference[i]) / (p.speed_margin * qd_max[i])
+        size += d * d
+    size, step = math.sqrt(size), JOINT_RATE * dt
+    share = step / size if size > step else 1.0
+    for i in range(n):
+        reference[i] += share * (e[i] * speed - reference[i])
+
+
+@leaf_kernel
+def joint_torque(A: F64, qd: F64, reference: F64, k_v: float, out: F64) -> None:
+    """Write the torques A k_v (r - qd) of joints that follow a reference r (n,) [rad/s] into rows of out (4, n)."""
+    n = qd.shape[0]
+    for i in range(n):
+        spring = damper = 0.0
+        for j in range(n):
+            spring += A[i, j] * (k_v * reference[j])
+            damper += A[i, j] * (-k_v * qd[j])
+        out[POSTURE_SPRING, i], out[POSTURE_DAMPER, i] = spring, damper
 
 
 class TaskDynamics(NamedTuple):

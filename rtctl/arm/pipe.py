@@ -13,7 +13,7 @@ from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import parameters_of, shapes_of, table_of
 from rtctl.arm.gripper import DRIVEN, gripped, refused, unasked
 from rtctl.arm.law import REVIEW
-from rtctl.arm.memory import Memory, fresh, record_of
+from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
 from rtctl.arm.model import Model
 from rtctl.arm.payload import with_payload
 from rtctl.arm.record import record_dtype, with_grippers
@@ -32,7 +32,7 @@ from rtctl.arm.servo_level import (
     asking,
     servo,
 )
-from rtctl.arm.supervision import hold_at, supervise, with_goal
+from rtctl.arm.supervision import hold_at, supervise, with_advice, with_goal
 from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, pursues
 from rtctl.arm.task import between, point_of
 from rtctl.kernel.rotations import exp3, quat_of
@@ -56,6 +56,7 @@ from rtctl.types import (
 )
 from rtctl.world import obstacle_table, primitives
 
+SIGMA_MIN = 0  # its place in the parameters, see `flat.parameters_of`
 ZERO = np.zeros(3)
 DRIVES = tuple(Drive(i) for i in range(5))  # an enumeration looks its numbers up slowly
 
@@ -66,31 +67,33 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     feedback: the drives' replies of this slot; request: what operators and sensors sent since the previous tick.
     """
     f = feedback if type(feedback.link) is int else feedback._replace(link=int(feedback.link))
-    asked = request.verb or request.goal is not None or request.payload is not None
+    asked = request.verb or request.goal is not None or request.advice is not None or request.payload is not None
     bits, verb, m = REQUEST if asked else 0, int(request.verb), memory
     blocked_by, refusal = memory.blocked_by, ""
     if request.obstacles:
         m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
         refusal = m.refusal
-    arm, model, parameters, placed, shapes = robot.arm, m.model, m.parameters, m.placed, m.shapes
+    arm, model, parameters, placed, shapes, ends = robot.arm, m.model, m.parameters, m.placed, m.shapes, m.ends
     bodies = placed.obstacles.mesh, placed.obstacles.clouds
-    hot, table, raw, flags = servo(arm, m.hot, parameters, m.table, shapes, bodies, f, asking(START, bits, verb))
+    hot, table, raw, flags = servo(arm, m.hot, parameters, m.table, shapes, bodies, ends, f, asking(START, bits, verb))
     if flags & MODEL:
         model, parameters = _evaluated(robot, hot, model)
         bits |= WORLD if flags & MOVED else 0
-        hot, table, raw, flags = servo(arm, hot, parameters, table, shapes, bodies, f, asking(MEASURED, bits, verb))
+        hot, table, raw, flags = servo(
+            arm, hot, parameters, table, shapes, bodies, ends, f, asking(MEASURED, bits, verb)
+        )
     if flags & ATTENTION:
-        m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, m.grippers)
+        m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends, m.grippers)
         m, chosen = _decided(robot, m, feedback, request)
-        hot, table, blocked_by, refusal = m.hot, m.table, m.blocked_by, m.refusal
+        hot, table, blocked_by, refusal, ends = m.hot, m.table, m.blocked_by, m.refusal, m.ends
         model, parameters = m.model, m.parameters
         hot, table, raw, flags = servo(
-            arm, hot, parameters, table, shapes, bodies, f, asking(DECIDED, bits | chosen, verb)
+            arm, hot, parameters, table, shapes, bodies, ends, f, asking(DECIDED, bits | chosen, verb)
         )
     if not robot.carry:
         model = model._replace(q=record_of(hot)["q"][0, : robot.n])  # the points have not moved either
-    words = () if flags & WORDS else blocked_by
-    m = Memory(hot, robot.n, refusal, words, model, parameters, placed, table, shapes, memory.grippers)
+    blocked_by = () if flags & WORDS else blocked_by
+    m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends, memory.grippers)
     record = np.frombuffer(raw, record_dtype(robot.n, robot.slots))
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
@@ -135,8 +138,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         shapes_of(table.obstacles, table.moving, table.creep, table.stale),
         table_of(table.obstacles, table.age, far, far),
     )
-    grippers = unasked(len(robot.grippers))
-    return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes, grippers)._replace(
+    ends, grippers = np.zeros((len(robot.points.radius), 3)), unasked(len(robot.grippers))
+    return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes, ends, grippers)._replace(
         tick=-1,
         state=State.IDLE,
         since=-1,
@@ -162,20 +165,28 @@ def _evaluated(robot: Robot, hot: F64, model: Model) -> tuple[Model, F64]:
     h, n = record_of(hot)[0], robot.n
     if h["evaluated"]:
         model = robot.body.evaluate(h["q"][:n], h["qd"][:n], robot.points, robot.own, h["payload"].tolist())
-    return model, parameters_of(model, int(h["task"]), h["axis"], robot.motion)
+    parameters = parameters_of(model, int(h["task"]), h["axis"], robot.motion)
+    if not h["task"]:  # the joints lead: no task is singular, and the log holds numbers
+        parameters[SIGMA_MIN] = 0.0
+    return model, parameters
 
 
 def _perceived(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> Memory:
-    """Obstacles: extrapolated to this slot, then replaced by what was seen; and why that was refused."""
+    """Obstacles: extrapolated to this slot, then replaced by what was seen; and why that was refused.
+
+    That the links of the goal's posture keep the clearance was measured among other ones, unless all that is new moves.
+    """
     elapsed = robot.dt * (1 + min(feedback.missed, MISSED_MAX))
     table, refusal = obstacle_table.edited(obstacle_table.advanced(m.world, elapsed), request.obstacles)
-    return m._replace(world=table, refusal=refusal)
+    m = m._replace(world=table, refusal=refusal)
+    rests = any(e.shape is not None and not (e.shape.velocity.any() or e.shape.omega.any()) for e in request.obstacles)
+    return m._replace(has_posture=1) if rests and m.has_posture == MEASURED_POSTURE else m
 
 
 def _decided(robot: Robot, m: Memory, feedback: Feedback, request: Request) -> tuple[Memory, int]:
     """Return the memory after what is rare: the supervisor's events, a new goal, the side of an escape (CHOSEN)."""
     m = supervise(robot, with_payload(robot, m, request), feedback, request, m.present)
-    m = with_goal(robot, m, request)
+    m = with_advice(robot, with_goal(robot, m, request), request)
     if pursues(record_of(m.hot)[0]) and m.escape.phase == escape.Phase.CHOOSING:
         return _with_side(robot, m), CHOSEN
     return m, 0

@@ -79,6 +79,8 @@ class Robot(NamedTuple):
     obstacles: tuple[Shape, ...]  # of the config, always there
     motion: MotionParams
     avoid: FieldParams
+    postures: bool  # a posture of the goal's own is looked for
+    plans: bool  # a planner may lead the arm where the law does not get on
     escape: bool  # circulate around what holds the arm short of its goal
     self_avoid: FieldParams
     limit: LimitParams

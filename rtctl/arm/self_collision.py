@@ -36,7 +36,7 @@ class Own:
         """pairs (L, 2): indices of hulls, far link first. reach [m]: pairs farther apart than this are not measured."""
         self.hulls, self.pairs, self.reach = hulls, pairs, reach
         self.names = tuple((hulls[i].name, hulls[j].name) for i, j in pairs)
-        self._hulls = Hulls(
+        self.arrays = Hulls(
             link=np.array([h.link for h in hulls], np.int64),
             centre=np.array([h.centre for h in hulls]).reshape(-1, 3),
             radius=np.array([h.radius for h in hulls]),
@@ -48,7 +48,7 @@ class Own:
 
     def near(self, Rj: F64, tj: F64) -> I64:
         """Return the pairs (k,) that are not proven to be farther apart than `reach`; arguments as in `measure`."""
-        return _near(self.pairs, self._hulls, self.reach + SLACK, Rj, tj)
+        return not_apart(self.pairs, self.arrays, self.reach + SLACK, Rj, tj)
 
     def meet(self, Rj: F64, tj: F64, met: B1) -> None:
         """Set in met (L,) what is nearer than `reach`; what is set already is not measured again."""
@@ -78,7 +78,7 @@ class Own:
                 rho[s] = d
                 n = -np.asarray(self._result.normal)  # coal's points from the first to the second
                 a, b = np.asarray(self._result.getNearestPoint1()), np.asarray(self._result.getNearestPoint2())
-                far, near = self._hulls.link[self.pairs[s]]
+                far, near = self.arrays.link[self.pairs[s]]
                 _gradient(n, a, b, far, near, Jw, iv, chain, rows[s])
         return rho, rows
 
@@ -107,7 +107,7 @@ class Hulls(NamedTuple):
 
 
 @kernel
-def _near(pairs: I64, hulls: Hulls, reach: float, Rj: F64, tj: F64) -> I64:
+def not_apart(pairs: I64, hulls: Hulls, reach: float, Rj: F64, tj: F64) -> I64:
     """Return the pairs (k,) whose hulls no tried plane holds farther apart than reach [m]; balls are tried first."""
     world = np.empty((hulls.link.shape[0], 3))
     for k in range(hulls.link.shape[0]):

@@ -35,7 +35,7 @@ from rtctl.arm.estimator import (
 )
 from rtctl.arm.faults import AUTOMATIC, FAULTS, Bounds, Counters, Evidence, counted, detect, implausible_positions
 from rtctl.arm.model import Model
-from rtctl.arm.target import target_of
+from rtctl.arm.target import leads, target_of
 from rtctl.control.faults import latch_with
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, largest
@@ -147,10 +147,11 @@ def predict(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     m.evaluated = 1 if phase > 0.0 else 0
     m.phase = phase - 1.0 if phase > 0.0 else phase
     target = target_of(m, m.has_goal != 0)
-    changed = target.task != m.task
+    task = 0 if leads(m) else target.task  # all of the motion is the joints'
+    changed = task != m.task
     for i in range(3):
         changed = changed or target.axis[i] != m.axis[i]
-    m.task = target.task
+    m.task = task
     m.axis[:] = target.axis
     return bool(changed or m.evaluated != 0)
 

@@ -12,12 +12,13 @@ import numpy as np
 
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
+from rtctl.arm.field import LEAST_REACH, Ends
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.friction import rubbing
-from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Cover, Motion, WorkMemory, law, outputs
+from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Ahead, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
 from rtctl.arm.loads import loaded, observe, pushed
-from rtctl.arm.memory import HOT
+from rtctl.arm.memory import HOT, MEASURED_POSTURE
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
 from rtctl.arm.own_loop import given, holds_itself, own_loop
@@ -25,13 +26,13 @@ from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
 from rtctl.arm.robot import Arm
 from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torque, plausible_feedback, predict
-from rtctl.arm.target import parking_progress, progress_timers, pursues, target_of, wanted
+from rtctl.arm.target import leads, limit_zones, parking_progress, progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
 from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Status, Task
 from rtctl.world.obstacle_table import distances_from, margins
-from rtctl.world.primitives import advanced_pose
+from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
 
 # where a call begins
 START, MEASURED, DECIDED = 0, 1, 2
@@ -212,8 +213,28 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
 
 
 @kernel
+def _ahead(arm: Arm, m: RecordRow, obstacles: Obstacles, points: F64, n: int) -> Ahead:
+    """Return what is known of the posture that the goal is pursued in; points (m, 3) [m] in it."""
+    c, rho0 = arm.constants[0], arm.constants[0].avoid_rho0
+    if m.has_posture == 0 or not pursues(m):
+        return Ahead(Ends(points[:0], np.empty((0, 0)), 0.0), c.limit_rho0[:n].copy(), False, np.zeros(n))
+    found = np.empty((obstacles.active.shape[0], 4, points.shape[0]))
+    distances_into(points.T.copy(), arm.radius, obstacles, rho0, found)
+    # the points stand out of the links: where the links themselves are known to keep the clearance, points need not
+    least = LEAST_REACH * (c.avoid_rho_num if m.has_posture == MEASURED_POSTURE else c.avoid_rho_min)
+    return Ahead(Ends(points, found[:, 0].copy(), least), limit_zones(c, m, n), leads(m), m.lead[:n].copy())
+
+
+@kernel
 def _act(
-    arm: Arm, m: RecordRow, model: Model, space: OperationalSpace, around: Surroundings, f: Feedback, asked: Asked
+    arm: Arm,
+    m: RecordRow,
+    model: Model,
+    space: OperationalSpace,
+    around: Surroundings,
+    f: Feedback,
+    asked: Asked,
+    ends: F64,
 ) -> tuple[U32, int]:
     """Run the second half of a tick; return its record in words, and what `progress_timers` asks for."""
     c, n = arm.constants[0], f.q.shape[0]
@@ -223,6 +244,7 @@ def _act(
     at = loaded(model, carried, q if c.carry == 0.0 else model.q)  # without carrying, points have not moved either
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
+    ahead = _ahead(arm, m, around.obstacles, ends, n)
     _, m.limit_flags = law(
         arm.constants,
         Cover(arm.radius, arm.link),
@@ -241,6 +263,7 @@ def _act(
             m.qdd[:n].copy(),
             m.floating != 0,
             hand,
+            ahead,
         ),
         WorkMemory(arm.reals, arm.wholes),
         out,
@@ -249,6 +272,8 @@ def _act(
     # where it is, not where it might be: no contact by growing old
     around.rho[:] = seen[: nearest.shape[0]] + around.obstacles.margin
     m.v_ref[:], m.w_ref[:], m.tau_obstacles[:n] = task[6:9], task[9:], torques[OBSTACLES]
+    if ahead.leads:  # and when it ends the tip goes on as it is
+        m.v_ref[:], m.w_ref[:], m.lead[:n] = xd, omega, ahead.reference
     if holds_itself(c, m):
         command, tau_wanted = _held(c, m, f, model, around)
     else:
@@ -281,12 +306,14 @@ def servo(
     table_before: F64,
     shapes: F64,
     bodies: BODIES,
+    ends: F64,
     feedback: Feedback,
     asked: int,
 ) -> tuple[F64, F64, U32, int]:
     """Run the servo level of one tick from a stage on, or until Python is needed.
 
     before: the memory, see `memory.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.
+    ends: of the memory.
     Returns the memory, the table, the words of the tick's record, and flags: DONE | WORDS when it is over; MODEL:
     evaluate the model at the joints of the memory where its `evaluated` says so, and the task space, then go on at
     MEASURED; ATTENTION: supervise, then go on at DECIDED; DIAGNOSE: the tick is over but for what holds the arm. MOVED:
@@ -302,5 +329,5 @@ def servo(
     flags = _sense(arm.constants[0], m, feedback, model, around, wish) if wish.stage != DECIDED else DONE
     if flags & (MODEL | ATTENTION):
         return memory, table, np.empty(0, np.uint32), flags
-    raw, more = _act(arm, m, model, space, around, feedback, wish)
+    raw, more = _act(arm, m, model, space, around, feedback, wish, ends)
     return memory, table, raw, flags | more

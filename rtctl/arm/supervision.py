@@ -5,7 +5,7 @@ import numpy as np
 from rtctl.arm import faults, task
 from rtctl.arm.escape import Escape
 from rtctl.arm.faults import BIT
-from rtctl.arm.memory import Memory
+from rtctl.arm.memory import MEASURED_POSTURE, Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.servo_level import ENABLE_TIMEOUT, REST_HOLD, SETTLE, STOP_TIME
 from rtctl.control import goals, supervisor
@@ -15,6 +15,7 @@ from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Feedback, Goal, Request, Severity, State, Status, Task, Verb
 from rtctl.world import obstacle_table
 
+LEAD_TIME = 0.5  # [s] for which the joints head for a posture unless they are told so again
 CLEAR_TIME = 0.1  # [s] for which latched drive faults are cleared after a reset
 CLEARING = "drive faults are being cleared now: reset again"
 OUTSIDE = "a joint is beyond its limits: move it back by hand, or use recover"
@@ -145,7 +146,8 @@ def to_park(robot: Robot, m: Memory) -> Memory:
     x, R, nothing = m.tip.x.copy(), quat_of(m.tip.R), Task(0)
     goal = Goal(x, R, nothing, 1.0, PARK_TOLERANCE, posture=robot.park)
     rho = obstacle_table.distance_from(m.world, x)
-    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, parking=True, floating=False)
+    m = free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, parking=True, floating=False)
+    return m._replace(ends=m.ends if robot.park is None else robot.body.placed(robot.park, robot.points))
 
 
 def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
@@ -158,6 +160,7 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         refusal = f"goal: not possible in state {m.state.name}"
     elif m.outside:
         refusal = "goal: a joint is still beyond its limits"
+    ends = m.ends
     if goal.posture is not None and not _is_posture(robot, goal.posture):
         refusal = refusal or f"goal: got posture {goal.posture}, wanted {robot.n} angles within the joint limits"
     wanted, why = task.within(goal.task, robot.axes)
@@ -167,7 +170,28 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
     refusal = refusal or why or goals.refusal(near, robot.base, robot.reach, rho, m.world.names)
     if refusal:
         return m._replace(refusal=refusal)
-    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, floating=False)
+    if goal.posture is not None:
+        ends = robot.body.placed(goal.posture, robot.points)
+    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, floating=False, ends=ends)
+
+
+def with_advice(robot: Robot, m: Memory, request: Request) -> Memory:
+    """Return the memory with the request's advice about the goal; without what cannot be followed: nobody asked for it.
+
+    Progress is counted anew when it is another posture, not when the same one is told again.
+    """
+    advice, goal = request.advice, m.goal
+    if advice is None or goal is None or m.parking or m.state != State.RUN or not _is_posture(robot, advice.posture):
+        return m
+    known = goal.posture is not None and np.array_equal(goal.posture, advice.posture)
+    led = m.tick <= m.lead_until
+    m = m._replace(goal=goal._replace(posture=advice.posture), ends=robot.body.placed(advice.posture, robot.points))
+    if advice.clear:
+        m = m._replace(has_posture=MEASURED_POSTURE)
+    if advice.leads:
+        m = m._replace(lead_until=m.tick + round(LEAD_TIME / robot.dt), escape=Escape())
+        return m if led else m._replace(lead=m.joints.qd)
+    return m if known else m._replace(still=0, nearest=np.inf, stall_timer=0.0, escape=Escape())
 
 
 def free_of_goals(m: Memory) -> Memory:

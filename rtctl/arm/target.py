@@ -10,6 +10,7 @@ import numpy as np
 
 from rtctl.arm.escape import Escape, Phase, advance, push_along, way
 from rtctl.arm.faults import BRAKES
+from rtctl.arm.field import APART, LEAST_REACH
 from rtctl.arm.law import motion_params
 from rtctl.arm.model import Model
 from rtctl.arm.progress import STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
@@ -74,6 +75,28 @@ def _braking(m: RecordRow) -> bool:
 def pursues(m: RecordRow) -> bool:
     """Return whether the tip is on its way to the goal."""
     return bool(m.has_goal != 0 and m.state == _RUN and not _braking(m))
+
+
+@kernel
+def leads(m: RecordRow) -> bool:
+    """Return whether the joints head for the posture of the goal, instead of the tip for the goal."""
+    return bool(m.has_posture != 0 and m.tick < m.lead_until and pursues(m))
+
+
+@kernel
+def limit_zones(c: RecordRow, m: RecordRow, n: int) -> F64:
+    """Return the zones (n,) [rad] in which joint limits push: no wider than what the goal's posture keeps free of them.
+
+    As for obstacles, see `field.field_to`.
+    """
+    zone: F64 = c.limit_rho0[:n].copy()
+    if m.has_posture != 0 and pursues(m):
+        for i in range(n):
+            q, goal = m.q[i], m.goal_posture[i]
+            low, high = c.q_min[i], c.q_max[i]
+            margin = (goal - low if q - low < high - q else high - goal) + APART * abs(q - goal)
+            zone[i] = min(zone[i], max(margin, LEAST_REACH * c.limit_rho_min[i]))
+    return zone
 
 
 @kernel
@@ -160,6 +183,8 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
             e, e_rot = selected(m.task, m.axis.copy(), R, e, e_rot)
     if not pursuing:
         return e, e_rot, m.q_rest[:n].copy()
+    if leads(m):
+        return np.zeros(3), np.zeros(3), m.goal_posture[:n].copy()
     if m.escape_phase != _NONE:
         e = _escape(c, m, model, chosen, e)
     return e, e_rot, m.goal_posture[:n].copy() if m.has_posture != 0 else c.q_rest[:n].copy()
@@ -169,7 +194,7 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
 def _forget_goal(m: RecordRow) -> None:
     m.has_goal, m.goal_task, m.goal_tolerance, m.goal_tolerance_rot, m.has_posture = 0, 0, 0.0, 0.0, 0
     m.parking = 0
-    m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:] = 0.0, 0.0, 0.0, 0.0
+    m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:], m.lead_until = 0.0, 0.0, 0.0, 0.0, 0
     m.status, m.still, m.nearest, m.stall_timer = _NO_GOAL, 0, np.inf, 0.0
     m.blocker, m.blockers = -1, np.uint64(0)
     _no_escape(m)
@@ -219,6 +244,9 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
         _no_escape(m)
         m.still = m.still + 1
         return changed
+    if leads(m):  # who leads sees to the progress
+        m.still, m.nearest, m.stall_timer = 0, np.inf, 0.0
+        return _take_status(m, _MOVING)
     if _circulates(m) or m.escape_phase == _CHOOSING:
         m.status, m.still = _ESCAPING, 0  # held by what it circulates
         return SAME

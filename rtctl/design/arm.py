@@ -128,6 +128,8 @@ def build(config: Config, path: str | Path) -> Robot:
         meshes=assets.meshes,
         motion=_motion(config),
         avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
+        postures=config.avoid.posture == "auto",
+        plans=config.avoid.plan == "auto",
         escape=config.avoid.escape,
         self_avoid=_field(
             config, config.avoid.self_influence_m, config.avoid.self_clearance_m, 1.0 / config.motion.singular_1_kg
@@ -276,7 +278,7 @@ def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[
     listed = config.avoid.points
     try:
         if isinstance(listed, str):
-            points, coverage = psp.place(body)
+            points, coverage = psp.place(body, config.avoid.overhang_m)
         else:
             points, coverage = psp.given(body, [(p.link, np.array(p.position_m), p.radius_m) for p in listed])
     except ConfigError as error:  # its place is the key alone

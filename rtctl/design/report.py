@@ -18,6 +18,7 @@ from rtctl.types import F64
 OK, WARN = "ok", "warn"
 SLOW = 0.3  # [rad/s] at which a joint without brake may sink
 SAG = 0.2  # [rad] of a joint that only its drive's kp holds, beyond which that is worth a warning
+WAY_ROOM = 1.2  # of the clearance, that a planned way keeps at least
 
 
 class Row(NamedTuple):
@@ -69,6 +70,11 @@ def report(config: Config, robot: Robot) -> Report:
 
 def _row(name: str, value: float, unit: str, note: str, fine: bool = True) -> Row:
     return Row(name, float(value), unit, OK if fine else WARN, note)
+
+
+def _gap(r: Robot) -> float:
+    """Return by how much [m] a gap must be wider than a link: on either side the overhang, and what a way keeps."""
+    return 2.0 * (r.coverage.overhang + WAY_ROOM * r.avoid.rho_min)
 
 
 def _bus(c: Config) -> list[Row]:
@@ -221,6 +227,7 @@ def _points(c: Config, r: Robot) -> list[Row]:
         _row("points cover", 100 * cover.fraction, "%", "of the links' surface samples", fine),
         _row("protrusion", cover.protrusion, "m", f"of a link beyond its points; clearance {r.avoid.rho_min:g}", fine),
         _row("overhang", cover.overhang, "m", "of the points beyond the links"),
+        _row("gap", _gap(r), "m", "wider than a link: what a planned way surely passes; overhang_m and clearance_m"),
         _row(
             "self-collision pairs",
             len(r.own.pairs),

@@ -42,7 +42,7 @@ def run(say: Say = unsaid, turns: tuple[float, ...] = TURNS) -> Data:
             for k, turn in enumerate(turns)
         ],
     }
-    trace = played(scenario, config_file("panda"), say)
+    trace = played(scenario, config_file("panda"), say, {"avoid": {"posture": "never", "plan": "never"}})
     return Data(trace, turns, float(trace.robot.limit.rho0.max()))
 
 

@@ -20,7 +20,8 @@ GOAL = [0.45, -0.25, 0.3]  # [m] beyond the wall
 AT = 0.5  # [s] when goals are given
 BESIDE = [0.0639, -0.0741, 0.4370, -2.2232, 0.0376, 2.1557, 1.2645]  # [rad] the tip on the other side of it
 WALL = {"name": "wall", "type": "box", "size_m": [0.5, 0.02, 0.4], "position_m": [0.45, 0.0, 0.2]}
-ALONE: dict[str, dict[str, object]] = {"avoid": {"escape": False}}
+ESCAPES: dict[str, dict[str, object]] = {"avoid": {"posture": "never", "plan": "never"}}
+ALONE: dict[str, dict[str, object]] = {"avoid": {**ESCAPES["avoid"], "escape": False}}
 FACING, ASIDE = axis_view(1, 2), axis_view(0, 2)
 
 
@@ -48,7 +49,7 @@ def run(say: Say = unsaid, seconds: tuple[float, float, float, float] = (8.0, 8.
 
     def part(k: int) -> Trace:
         scenario = {**told[k], "duration_s": seconds[k]}
-        return played(scenario, panda, lambda done: say((k + done) / 4.0), {} if k % 2 else ALONE)
+        return played(scenario, panda, lambda done: say((k + done) / 4.0), (ALONE, ESCAPES, ALONE, {})[k])
 
     under = np.array(trap["goal"][0]["position_m"])
     return Data(Case(part(0), part(1), np.array(GOAL)), Case(part(2), part(3), under))

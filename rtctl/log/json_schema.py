@@ -54,6 +54,11 @@ _REQUEST = _object(
     tick=_INTEGER,
     verb=_STRING,
     goal=_GOAL,
+    advice=_object(
+        posture=_list(_NUMBER, "(n,) [rad]"),
+        leads=_is("boolean", "the joints head for it"),
+        clear=_is("boolean", "the links in it keep the clearance"),
+    ),
     obstacles=_list(_object(name=_STRING, age=_is("number", "[s]"), feed=_is("boolean"), shape=_SHAPE)),
 )
 _CHECKPOINT = _object(  # its `memory`, of the tick, is an array of all kinds of things

@@ -192,10 +192,20 @@ class Avoid(Table, frozen=True, kw_only=True):
     clearance_m: Annotated[float, Meta(ge=0.001, le=0.5, description="rho_min: v_max is spent here")]
     damping_ratio: Annotated[float, Meta(ge=0.05, le=5.0, description="of the one-sided damping while closing")]
     points: Literal["auto"] | Annotated[tuple[Point, ...], Meta(min_length=1, max_length=256)] = "auto"
+    overhang_m: Annotated[
+        float, Meta(ge=0.01, le=0.05, description="that auto points may stand out of links; less gives more of them")
+    ] = 0.025
     lookahead_s: Annotated[float, Meta(ge=0.0, le=1.0, description="closing speed widens the influence by this")] = 0.1
     escape: Annotated[bool, Meta(description="circulate around an obstacle that holds the arm short of its goal")] = (
         True
     )
+    posture: Annotated[
+        Literal["auto", "never"],
+        Meta(description="auto: a goal is pursued in a posture of its own; never: in that of rest"),
+    ] = "auto"
+    plan: Annotated[
+        Literal["auto", "never"], Meta(description="auto: a planner leads the arm where the law alone does not get on")
+    ] = "auto"
     self_collision: bool = True
     self_influence_m: Annotated[float, Meta(ge=0.005, le=0.5)] = 0.02
     self_clearance_m: Annotated[float, Meta(ge=0.001, le=0.2)] = 0.008

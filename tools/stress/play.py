@@ -11,6 +11,7 @@ from rtctl import design as cfg
 from rtctl.app.arm import ARM, ArmServo
 from rtctl.app.arm_link import ArmLink, link_spec
 from rtctl.app.arm_scene import ArmFeed, ArmTally, ArmTurn
+from rtctl.app.guide import Guide
 from rtctl.app.servo import Servo
 from rtctl.app.simulator import open_simulator
 from rtctl.arm import faults
@@ -125,10 +126,10 @@ def _numbers(record: Any) -> bool:
     return True
 
 
-def play(table: dict[str, Any], index: int, path: Path | None = None) -> Seen:
+def play(table: dict[str, Any], index: int, path: Path | None = None, guided: bool = True) -> Seen:
     """Return what was seen of a scenario given as tables; it ends with its first contact, or settled at the goal.
 
-    path: the robot file, in place of the one in configs/.
+    path: the robot file, in place of the one in configs/. guided: False leaves the law alone.
     """
     name = table["robot"]
     path = path or CONFIGS / f"{name}.toml"
@@ -139,14 +140,16 @@ def play(table: dict[str, Any], index: int, path: Path | None = None) -> Seen:
     try:
         servo = Servo(ARM, robot, link, None, link.greet(lockstep=True))
         watch = Watch(robot, simulator.plant)
-        _run(servo, scenario, simulator, watch)
+        _run(servo, scenario, simulator, watch, guided)
         return _seen(servo, watch, name, index)
     finally:
         link.close()
 
 
-def _run(servo: ArmServo, scenario: Scenario, simulator: Any, watch: Watch) -> None:
-    feed = ArmFeed(servo.robot, scenario, simulator, watch)
+def _run(servo: ArmServo, scenario: Scenario, simulator: Any, watch: Watch, guided: bool) -> None:
+    robot = servo.robot
+    guide = Guide(robot, robot.plans, scenario.seed) if guided else None
+    feed = ArmFeed(robot, scenario, simulator, watch, guide)
     moving = any(not s.still for s in simulator.plant.solids)
     for slot in lockstep():
         truth = watch.truth()

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from rtctl.plain import Json
-from rtctl.types import Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
+from rtctl.types import Advice, Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
@@ -14,6 +14,8 @@ def encode_request(tick: int, request: Request) -> bytes:
     body: Json = {"tick": tick, "verb": request.verb.name.lower()}
     if request.goal is not None:
         body["goal"] = {k: _plain(v) for k, v in request.goal._asdict().items() if v is not None}
+    if request.advice is not None:
+        body["advice"] = {k: _plain(v) for k, v in request.advice._asdict().items()}
     if request.obstacles:
         body["obstacles"] = [
             {"name": e.name, "age": e.age, "feed": e.feed} | ({} if e.shape is None else {"shape": _shape(e.shape)})
@@ -30,7 +32,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
     """Return the tick index and the request of `encode_request`'s JSON. Raises ValueError."""
     try:
         body = msgspec.json.decode(data)
-        goal = body.get("goal")
+        goal, advice = body.get("goal"), body.get("advice")
         edits = tuple(
             ObstacleEdit(
                 e["name"],
@@ -41,8 +43,15 @@ def decode_request(data: bytes) -> tuple[int, Request]:
             for e in body.get("obstacles", ())
         )
         payload = None if body.get("payload") is None else Payload(*map(float, body["payload"]))
-        verb = Verb[body["verb"].upper()]
-        return int(body["tick"]), Request(verb, None if goal is None else _goal(goal), edits, payload, _grip(body))
+        asked = Request(
+            Verb[body["verb"].upper()],
+            None if goal is None else _goal(goal),
+            edits,
+            payload,
+            None if advice is None else _advice(advice),
+            _grip(body),
+        )
+        return int(body["tick"]), asked
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"not a request: {error}") from None
 
@@ -74,6 +83,10 @@ def _shape_of(body: Json) -> Shape:
         str(body.get("mesh", "")),
         base64.b64decode(body.get("cloud", ""), validate=True),  # as on the wire: 60 kB at most
     )
+
+
+def _advice(body: Json) -> Advice:
+    return Advice(np.array(body["posture"], np.float64), bool(body["leads"]), bool(body["clear"]))
 
 
 def _grip(body: Json) -> Grip | None:

@@ -1,0 +1,291 @@
+"""Beside the servo: finds what a goal needs that the law does not see, and says so as advice.
+
+Of a new goal it looks where the tip's own way would end. Where that is short of the goal, or in a limit or a shadow, it
+finds a posture that has the goal (`postures`): the null space heads for it, or the joints do, when the tip's way does
+not lead there. Where the arm is held all the same it plans a way (`plan`) and leads the joints along it; it yields to
+what moves, plans anew on a blocked way, and tries again when something moved. Counts bound its work, so that in a
+simulation equal inputs give equal advice.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtctl.app.postures import (
+    Ending,
+    Site,
+    endings,
+    free_of_all,
+    links_clear,
+    packed,
+    previewed,
+    site_of,
+    straight_room,
+    swept,
+)
+from rtctl.app.way import Way, comes, heading, moves, progress, way_of, yielding
+from rtctl.arm.freedom import Room, body_of, first_blocked
+from rtctl.arm.kinematics import chain_of, clearance_of
+from rtctl.arm.memory import Memory
+from rtctl.arm.robot import Robot
+from rtctl.errors import PlanError
+from rtctl.kernel.rotations import quat_of
+from rtctl.types import F64, Advice, Goal, Shape, State, Status
+from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
+
+PERIOD = 0.01  # [s] between two pieces of advice
+LOOK = 0.05  # [s] between two looks at what comes
+HELD = frozenset(
+    (
+        Status.LOCAL_MINIMUM,
+        Status.ESCAPING,
+        Status.LIMITED,
+        Status.SHADOWED,
+        Status.SINGULAR,
+        Status.UNREACHABLE,
+        Status.SATURATED,
+    )
+)
+NEAR = 0.06  # [rad] from the end of a way, where the goal itself is headed for
+STUCK = 0.8  # [s] without progress along a way
+SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
+PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
+AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
+PLANS = 8  # for one goal in a world that stands still
+
+
+class Seen(NamedTuple):
+    """What the guide is shown of the memory."""
+
+    tick: int
+    state: State
+    status: Status
+    goal: Goal | None
+    q: F64  # (n,) [rad]
+    obstacles: Obstacles  # the slots that are in use; without meshes, which belong to the robot
+
+
+def seen_of(m: Memory) -> Seen:
+    """Return what of a memory the guide is shown."""
+    mesh = np.zeros(0)
+    return Seen(m.tick, m.state, m.status, m.goal, m.joints.q.copy(), packed(m.world.obstacles)._replace(mesh=mesh))
+
+
+def warm(robot: Robot) -> None:
+    """Run what it looks with once, so that nothing is compiled while an arm waits for advice."""
+    far = Shape(
+        "far", "sphere", np.full(4, 0.1), np.array([0.0, 0.0, 50.0]), quat_of(np.eye(3)), np.ones(3), np.ones(3)
+    )
+    site = site_of(robot, with_shape(obstacles_empty(1), 0, far), robot.home)
+    tip = robot.body.evaluate(robot.home, np.zeros(robot.n), robot.points)
+    goal = Goal(tip.x, quat_of(tip.R), robot.axes, robot.tolerance, robot.tolerance_rot)
+    endings(site, goal, 0, seeds=1)
+    previewed(site, goal, robot.q_rest)
+    links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
+    body, anchors = body_of(robot), robot.home[None]
+    first_blocked(body, anchors, site.obstacles, Room(0.0, 0.0, anchors, np.zeros((1, 2))), 1.0)
+
+
+class Guide:
+    """What is known beside the servo of one robot's goal."""
+
+    way: Way | None
+    given: Ending | None  # the posture that was advised
+    ends: list[Ending]
+    at: int  # which posture of the way it has come to
+    moved_at: int  # tick of the last progress along it
+    waits_since: int  # tick; -1: it does not wait
+    look: int  # tick of the next look at what comes
+    again: int  # tick of the next attempt
+    tries: int
+    blocked: bool  # something comes across the way
+    told: str  # why there was no way
+    scene: bytes  # what rests
+
+    def __init__(self, robot: Robot, plans: bool, seed: int = 0, at_once: bool = False) -> None:
+        """plans: a planner may lead the arm; at_once: it does so of each goal, before anything held the arm."""
+        self.robot, self.plans, self.seed, self.at_once = robot, plans, seed, at_once
+        self.chain = chain_of(robot.body)
+        self.events: list[tuple[str, str]] = []  # name, detail
+        self.fresh = self.taught = False
+        self._forget()
+
+    def begin(self) -> None:
+        """Take note of a new goal: the memory's."""
+        self._forget()
+        self.fresh = True
+
+    def due(self, tick: int) -> bool:
+        """Return whether it has anything to say after this tick; it need not be shown what the others left."""
+        return self.fresh or tick % max(1, round(PERIOD / self.robot.dt)) == 0
+
+    def advise(self, m: Seen) -> Advice | None:
+        """Return advice for the next tick, None for nothing new; m: what the last one left."""
+        if m.state != State.RUN or m.goal is None or m.status == Status.ARRIVED:
+            if m.goal is None:
+                self._forget()
+            self.way = None
+            return None
+        if self.fresh:
+            self.fresh, self.taught = False, m.goal.posture is not None  # by somebody who knows better
+            self.scene = self._scene(m)
+            return None if self.taught else self._first(m, m.goal)
+        if not self.due(m.tick):
+            return None
+        changed = m.tick >= self.look and self._scene(m) != self.scene
+        if changed:
+            self.scene, self.tries = self._scene(m), 0
+            self.look = m.tick + round(LOOK / self.robot.dt)
+        if self.way is not None:
+            return self._along(m, m.goal, self.way, changed)
+        if changed and not self.taught:
+            return self._reviewed(m, m.goal)
+        if m.status in HELD and m.tick >= self.again:
+            return self._held(m, m.goal)
+        return None
+
+    def _scene(self, m: Seen) -> bytes:
+        """Return what tells whether what rests is as it was."""
+        o = m.obstacles
+        rests = ~(o.v.any(axis=1) | o.w.any(axis=1))
+        return b"".join(each[rests].tobytes() for each in (o.kind, o.p, o.R, o.dims))
+
+    def _site(self, m: Seen) -> Site:
+        return Site(self.robot, self.chain, m.obstacles._replace(mesh=self.robot.meshes.data), m.q)
+
+    # -- the first look ----------------------------------------------------------------------------------------------
+
+    def _first(self, m: Seen, goal: Goal) -> Advice | None:
+        self.given = None
+        site = self._site(m)
+        if self.at_once and self.plans:
+            return self._planned(m, goal, site)
+        if not self.robot.postures:
+            return None
+        Q, there = previewed(site, goal, self.robot.q_rest)
+        if there and free_of_all(site, Q[-1]):
+            return None
+        self.ends = endings(site, goal, self.seed)
+        for end in self.ends:
+            Q, there = previewed(site, goal, end.q)
+            if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
+                return self._given(end)
+        led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)
+        if led is not None:
+            return led
+        if not there and self.plans:
+            return self._planned(m, goal, site)
+        return self._given(self.ends[0]) if self.ends else None
+
+    def _given(self, end: Ending) -> Advice:
+        self.given = end
+        return Advice(end.q, clear=end.clear)
+
+    def _reviewed(self, m: Seen, goal: Goal) -> Advice | None:
+        """Return what is to be said of the goal when what rests is not as it was."""
+        if self.given is not None:
+            site, was = self._site(m), self.given
+            rho = self._room(site, was.q)
+            clear = bool(links_clear(site, was.q[None], np.array([rho]))[0])
+            self.given = was._replace(rho=rho, clear=clear)
+            if clear or not was.clear:
+                return self._given(self.given)
+        if m.tick < self.again:
+            return None
+        self.again = m.tick + round(AGAIN / self.robot.dt)
+        return self._first(m, goal)
+
+    def _clear(self, site: Site, Q: F64) -> bool:
+        rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
+        return bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
+
+    def _straight(self, site: Site, end: Ending) -> Advice | None:
+        """Take the straight way to a posture where it is free."""
+        least = 0.9 * min(self.robot.avoid.rho_min, end.rho, self._room(site, site.start))
+        if straight_room(site, site.start, end.q) <= max(least, 1e-3):
+            return None
+        return heading(site, self._take(site, np.array([site.start, end.q])), 0, False)
+
+    def _room(self, site: Site, q: F64) -> float:
+        return float(clearance_of(site.chain, self.robot.points, q[None], site.obstacles)[0])
+
+    # -- what holds the arm ------------------------------------------------------------------------------------------
+
+    def _held(self, m: Seen, goal: Goal) -> Advice | None:
+        site = self._site(m)
+        self.again = m.tick + round(AGAIN / self.robot.dt)
+        if self.plans:
+            return self._planned(m, goal, site)
+        if m.status == Status.ESCAPING or self.tries >= PLANS or not self.robot.postures:
+            return None
+        self.tries += 1
+        self.ends = endings(site, goal, self.seed + self.tries)
+        far = [end for end in self.ends if np.abs(end.q - site.start).max() > 3.0 * NEAR]
+        return next((advice for end in far if (advice := self._straight(site, end)) is not None), None)
+
+    def _planned(self, m: Seen, goal: Goal, site: Site) -> Advice | None:
+        try:
+            from rtctl.app.plan import plan_joints  # heavy, few goals need it, and not everybody has installed it
+        except ImportError as error:
+            self.plans = False
+            self.events.append(("no_plan", f"the planner is not installed: {error}"))
+            return None
+        if self.tries >= PLANS and not moves(site):
+            return None
+        self.tries += 1
+        why = ""
+        for times in SWEPT if moves(site) else SWEPT[-1:]:
+            try:
+                path = plan_joints(swept(site, times), goal, self.seed + self.tries, within=np.inf)
+                break
+            except PlanError as error:
+                why = str(error)
+        else:
+            if self.told != why:
+                self.events.append(("no_plan", why))
+            self.told = why
+            self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
+            return None
+        self.events.append(("planned", f"a way of {len(path)} postures around what holds the arm"))
+        return heading(site, self._take(site, path), 0, False)
+
+    def _take(self, site: Site, path: F64) -> Way:
+        self.way = way_of(site, path)
+        self.at, self.moved_at, self.waits_since, self.blocked = 0, -1, -1, False
+        return self.way
+
+    # -- along a way -------------------------------------------------------------------------------------------------
+
+    def _along(self, m: Seen, goal: Goal, way: Way, changed: bool) -> Advice | None:
+        site, dt, at = self._site(m), self.robot.dt, progress(way, self.at, m.q)
+        if at > self.at or self.moved_at < 0:
+            self.at, self.moved_at = at, m.tick
+        if np.abs(m.q - way.Q[-1]).max() < NEAR:
+            self.way, self.again = None, m.tick + round(AGAIN / dt)
+            return self._given(way.end)
+        if changed or ((self.blocked or moves(site)) and m.tick >= self.look):
+            self.look = m.tick + round(LOOK / dt)
+            self.blocked = comes(site, way, self.at)
+        if self.blocked:
+            return self._yield(m, goal, site, way)
+        self.waits_since = -1
+        if (m.tick - self.moved_at) * dt > STUCK:
+            self.way = None
+            return self._planned(m, goal, site) if self.plans else self._given(way.end)
+        return heading(site, way, self.at, True)
+
+    def _yield(self, m: Seen, goal: Goal, site: Site, way: Way) -> Advice | None:
+        """Yield to what moves; after a while look for another way."""
+        self.moved_at = m.tick
+        if self.waits_since < 0:
+            self.waits_since = m.tick
+            self.events.append(("yields", "to what moves across the way"))
+        if (m.tick - self.waits_since) * self.robot.dt > PATIENCE:
+            self.waits_since, self.way = m.tick, None
+            return self._planned(m, goal, site) if self.plans else None
+        return yielding(site, way, self.at)
+
+    def _forget(self) -> None:
+        self.way, self.given, self.ends = None, None, []
+        self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
+        self.blocked, self.told, self.scene = False, "", b""

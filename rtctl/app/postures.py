@@ -1,0 +1,190 @@
+"""The goal's own posture: joints that have a goal, free of limits and obstacles, near in time, and on a way there.
+
+Inverse kinematics from many starts (damped least squares, compiled); of what it finds the least cost is taken, the time
+to go there and what it lacks in room. Counts bound the work, not time: equal inputs give equal postures.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from rtctl.arm.kinematics import ROLLOUT, Chain, Pace, chain_of, clearance_of, postures_of, rollout, target_of
+from rtctl.arm.model import RigidBody
+from rtctl.arm.points import Points
+from rtctl.arm.robot import Robot
+from rtctl.design.solids import solids_of, surface
+from rtctl.plain import Json
+from rtctl.types import B1, F64, I64, Goal
+from rtctl.world.primitives import Obstacles, advance
+
+SEEDS = 48  # random starts
+ENDS = 8  # postures returned at most
+ALIKE = 0.1  # [rad] within which two are one
+TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
+SKIN = 0.005  # [m] by which a clearance of the links may be understated
+STEP = 0.05  # [s] of a rollout
+TURN = 2.0 * np.pi
+SLOTS = Obstacles._fields[:9]  # what there is of each obstacle; the rest are bodies that they share
+
+
+class Site(NamedTuple):
+    """What a posture or a way is looked for in."""
+
+    robot: Robot
+    chain: Chain
+    obstacles: Obstacles  # the active ones alone
+    start: F64  # (n,) [rad]
+
+
+class Ending(NamedTuple):
+    """A posture that has the goal."""
+
+    q: F64  # (n,) [rad]
+    rho: float  # [m] from the points to obstacles
+    clear: bool  # the links keep the clearance from them
+    cost: float  # [s]
+
+
+def packed(obstacles: Obstacles) -> Obstacles:
+    """Return the slots that are in use alone."""
+    return _chosen(obstacles, np.flatnonzero(obstacles.active))
+
+
+def _chosen(obstacles: Obstacles, k: I64) -> Obstacles:
+    return obstacles._replace(**{name: getattr(obstacles, name)[k] for name in SLOTS})
+
+
+def swept(site: Site, times: Sequence[float]) -> Site:
+    """Return the site with what moves where it will be at each of the times [s] too, unless it will be at the start."""
+    o = site.obstacles
+    rests, moves = [_chosen(o, np.flatnonzero((o.v.any(axis=1) | o.w.any(axis=1)) == moving)) for moving in (0, 1)]
+    found, robot = [rests, moves], site.robot
+    for t in times:
+        there = advance(moves, t)
+        for k in range(len(there.active)):
+            one = _chosen(there, np.array([k]))
+            if clearance_of(site.chain, robot.points, site.start[None], one)[0] > 1.5 * robot.avoid.rho_min:
+                found.append(one)
+    joined: Json = {name: np.concatenate([getattr(each, name) for each in found]) for name in SLOTS}
+    return site._replace(obstacles=o._replace(**joined))
+
+
+def site_of(robot: Robot, obstacles: Obstacles, start: F64) -> Site:
+    """Return the site with the slots that are in use."""
+    return Site(robot, chain_of(robot.body), packed(obstacles), np.array(start, np.float64))
+
+
+def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = SEEDS) -> list[Ending]:
+    """Return postures that have the goal and touch nothing, the best first; none where none is found.
+
+    zone: share of the zones of joint limits that they keep free of; the clearance at least, unless the start does not.
+    """
+    robot = site.robot
+    margin = np.maximum(zone * robot.limit.rho0, 1.5 * robot.limit.rho_min)
+    low, high = np.minimum(robot.q_min + margin, site.start), np.maximum(robot.q_max - margin, site.start)
+    rng = np.random.default_rng(seed)
+    starts = np.concatenate([[site.start, robot.q_rest, robot.home], rng.uniform(low, high, (seeds, robot.n))])
+    found, has = postures_of(site.chain, starts, target_of(goal), low, high)
+    found = _unwound(site, found[has], low, high)
+    rho = clearance_of(site.chain, robot.points, found, site.obstacles)
+    out: list[Ending] = []
+    for k in np.argsort([_cost(site, q, r) for q, r in zip(found, rho, strict=True)], kind="stable"):
+        q = found[k]
+        if len(out) == ENDS or rho[k] <= 0.0:
+            break
+        if any(np.abs(q - other.q).max() < ALIKE for other in out):
+            continue
+        own = robot.body.own_distances(q, robot.own)
+        if not len(own) or own.min() >= robot.self_avoid.rho_min:
+            clear = bool(links_clear(site, q[None], rho[k : k + 1])[0])
+            out.append(Ending(q, float(rho[k]), clear, _cost(site, q, float(rho[k]))))
+    return out
+
+
+@cache
+def skin_of(body: RigidBody) -> Points:
+    """Return balls about samples of the links' surface that cover it, and stand out of it by their radius at most."""
+    solids = [s for s in solids_of(body) if s.link > 0]
+    samples = [surface(s, SKIN * np.sqrt(3.0))[0] for s in solids]  # a triangle's points are within edge/sqrt(3) of one
+    link = np.repeat([s.link for s in solids], [len(each) for each in samples]).astype(np.int64)
+    return Points(link, np.concatenate(samples), np.full(len(link), SKIN), ())
+
+
+def links_clear(site: Site, Q: F64, rho: F64) -> B1:
+    """Return in which postures (b, n) the links keep the clearance, by their skin; rho (b,) [m] of the points there."""
+    robot = site.robot
+    out: B1 = rho >= robot.avoid.rho_min
+    near = np.flatnonzero(~out & (rho > 0.0))
+    if len(near) and len(site.obstacles.active):
+        out[near] = clearance_of(site.chain, skin_of(robot.body), Q[near], site.obstacles) >= robot.avoid.rho_min
+    return out
+
+
+def _cost(site: Site, q: F64, rho: float) -> float:
+    """Return the time [s] to a posture, and what its lack of room counts."""
+    robot = site.robot
+    away = float((np.abs(q - site.start) / robot.qd_max).max())
+    room = min(max(rho, 0.0) / robot.avoid.rho0, 1.0)
+    touching = 100.0 if rho <= 0.0 else 0.0
+    margin = np.minimum(q - robot.q_min, robot.q_max - q) / robot.limit.rho0
+    return away + TIGHT * (1.0 - room) + TIGHT * (1.0 - min(float(margin.min()), 1.0)) + touching
+
+
+def _unwound(site: Site, Q: F64, low: F64, high: F64) -> F64:
+    """Return the postures with every joint that turns at the turn nearest to the start."""
+    out = Q.copy()
+    for i in np.flatnonzero(~site.chain.slides[1:]):
+        for turns in (-2.0, -1.0, 1.0, 2.0):
+            other = Q[:, i] + turns * TURN
+            nearer: B1 = (np.abs(other - site.start[i]) < np.abs(out[:, i] - site.start[i])) & (other >= low[i])
+            nearer &= other <= high[i]
+            out[nearer, i] = other[nearer]
+    return out
+
+
+def previewed(site: Site, goal: Goal, rest: F64) -> tuple[F64, bool]:
+    """Return the postures (k, n), STEP apart, in which the tip would go to a goal, and whether it gets there."""
+    robot, p = site.robot, site.robot.motion
+    margin = 0.4 * robot.limit.rho0
+    Q = rollout(
+        site.chain,
+        site.start,
+        rest,
+        target_of(goal),
+        robot.q_min + margin,
+        robot.q_max - margin,
+        Pace(p.v_max, p.w_max, p.speed_margin * robot.qd_max, p.qdd_posture / p.d_q, p.k_q / p.d_q),
+        STEP,
+    )
+    return Q, len(Q) <= ROLLOUT
+
+
+def free_of_all(site: Site, q: F64) -> bool:
+    """Return whether a posture is felt by no limit and no obstacle."""
+    robot = site.robot
+    margin = np.minimum(q - robot.q_min, robot.q_max - q)
+    rho = clearance_of(site.chain, robot.points, q[None], site.obstacles)[0]
+    return bool((margin >= robot.limit.rho0).all() and rho >= robot.avoid.rho0)
+
+
+def along(a: F64, b: F64, step: float) -> F64:
+    """Return postures from a to b (n,), no joint's more than a step [rad] apart; without a."""
+    count = max(1, int(np.ceil(np.abs(b - a).max() / step)))
+    out: F64 = a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
+    return out
+
+
+def straight_room(site: Site, a: F64, b: F64, step: float = 0.06) -> float:
+    """Return the least distance [m] to obstacles, or to what the arm's links keep of each other, between two postures.
+
+    Nothing or less where links come nearer to each other than their clearance.
+    """
+    robot = site.robot
+    Q = along(a, b, step)
+    rho = float(clearance_of(site.chain, robot.points, Q, site.obstacles).min())
+    if rho > 0.0 and len(robot.own.pairs):
+        own = min(float(robot.body.own_distances(q, robot.own).min()) for q in Q[:: max(1, len(Q) // 12)])
+        return rho if own >= robot.self_avoid.rho_min else 0.0
+    return rho

@@ -1,0 +1,335 @@
+"""Where links, points and tip are at many postures: the arm's kinematics compiled, for what asks thousands of times.
+
+    X_k = X_parent(k) X0_k exp(axis_k q_k)
+
+The numbers are Pinocchio's, taken once; tests hold every placement to its own.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from rtctl.arm.model import RigidBody, spd_inverse
+from rtctl.arm.points import Points
+from rtctl.arm.task import selection, task_error
+from rtctl.kernel import kernel
+from rtctl.types import B1, F64, I64, Goal
+from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
+
+REACHED = 1e-4  # [m], and ten times that [rad], of a posture that has a goal
+STEPS = 80  # of the inverse kinematics
+ROLLOUT = 160  # steps of a rollout
+NEAR_ENOUGH = 2e-3  # [m], and five times that [rad], where a rollout ends
+LARGEST = 0.4  # [rad] of a joint in one of them
+
+
+class Chain(NamedTuple):
+    """Joints and links of an arm; link 0 is the base, link k what joint k - 1 carries."""
+
+    parent: I64  # (n + 1,) link
+    R: F64  # (n + 1, 3, 3) of each joint in its parent's frame, at zero
+    t: F64  # (n + 1, 3) [m]
+    axis: F64  # (n + 1, 3) in the joint's own frame
+    slides: B1  # (n + 1,) a prismatic joint
+    moves: B1  # (n + 1, n) [link, joint]
+    tip: int  # link
+    tip_R: F64  # (3, 3) the tip's frame in that link
+    tip_t: F64  # (3,) [m]
+
+
+class Target(NamedTuple):
+    """A goal as compiled code takes it; fields as in types.Goal."""
+
+    task: int
+    axis: F64
+    position: F64
+    wxyz: F64
+
+
+def chain_of(body: RigidBody) -> Chain:
+    """Return the chain of a rigid body."""
+    model, n, skeleton = body.model, body.n, body.skeleton
+    R, t, axis, slides = np.tile(np.eye(3), (n + 1, 1, 1)), np.zeros((n + 1, 3)), np.zeros((n + 1, 3)), np.zeros(n + 1)
+    data, q = model.createData(), pin.neutral(model)
+    pin.computeJointJacobians(model, data, q)
+    for k in range(1, n + 1):
+        j = int(skeleton.joint[k])
+        X = model.jointPlacements[j]
+        R[k], t[k] = X.rotation, X.translation
+        S = pin.getJointJacobian(model, data, j, pin.ReferenceFrame.LOCAL)[:, int(skeleton.iv[k - 1])]
+        slides[k] = float(np.linalg.norm(S[3:]) < 0.5)
+        axis[k] = S[:3] if slides[k] else S[3:]
+    return Chain(
+        body.parent, R, t, axis, slides > 0.5, skeleton.chain, int(skeleton.tip), skeleton.tip_R, skeleton.tip_t
+    )
+
+
+def target_of(goal: Goal) -> Target:
+    """Return a goal as compiled code takes it."""
+    return Target(int(goal.task), goal.axis, goal.position, goal.wxyz)
+
+
+@kernel
+def placements(chain: Chain, q: F64, R: F64, t: F64) -> None:
+    """Write the links' placements (n + 1, 3, 3), (n + 1, 3) [m] at q (n,)."""
+    J, A = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        t[0, i] = 0.0
+        for j in range(3):
+            R[0, i, j] = 1.0 if i == j else 0.0
+    for k in range(1, chain.parent.shape[0]):
+        p, x = chain.parent[k], q[k - 1]
+        for i in range(3):
+            t[k, i] = t[p, i]
+            for j in range(3):
+                t[k, i] += R[p, i, j] * chain.t[k, j]
+                A[i, j] = 0.0
+                for l in range(3):
+                    A[i, j] += R[p, i, l] * chain.R[k, l, j]
+        a = chain.axis[k]
+        if chain.slides[k]:
+            for i in range(3):
+                for j in range(3):
+                    t[k, i] += A[i, j] * a[j] * x
+                    R[k, i, j] = A[i, j]
+            continue
+        c, s = np.cos(x), np.sin(x)
+        for i in range(3):
+            for j in range(3):
+                J[i, j] = a[i] * a[j] * (1.0 - c) + (c if i == j else 0.0)
+        J[0, 1] -= s * a[2]
+        J[0, 2] += s * a[1]
+        J[1, 0] += s * a[2]
+        J[1, 2] -= s * a[0]
+        J[2, 0] -= s * a[1]
+        J[2, 1] += s * a[0]
+        for i in range(3):
+            for j in range(3):
+                R[k, i, j] = A[i, 0] * J[0, j] + A[i, 1] * J[1, j] + A[i, 2] * J[2, j]
+
+
+@kernel
+def tip_at(chain: Chain, R: F64, t: F64) -> tuple[F64, F64, F64]:
+    """Return the tip's position (3,) [m], orientation (3, 3) and Jacobian (6, n) at the links' placements."""
+    n, k = chain.moves.shape[1], chain.tip
+    x, turn, J = t[k].copy(), np.zeros((3, 3)), np.zeros((6, n))
+    for i in range(3):
+        for j in range(3):
+            x[i] += R[k, i, j] * chain.tip_t[j]
+            for l in range(3):
+                turn[i, j] += R[k, i, l] * chain.tip_R[l, j]
+    z = np.empty(3)
+    for d in range(n):
+        if not chain.moves[k, d]:
+            continue
+        for i in range(3):
+            z[i] = R[d + 1, i, 0] * chain.axis[d + 1, 0] + R[d + 1, i, 1] * chain.axis[d + 1, 1]
+            z[i] += R[d + 1, i, 2] * chain.axis[d + 1, 2]
+        if chain.slides[d + 1]:
+            for i in range(3):
+                J[i, d] = z[i]
+            continue
+        r0, r1, r2 = x[0] - t[d + 1, 0], x[1] - t[d + 1, 1], x[2] - t[d + 1, 2]
+        J[0, d], J[1, d], J[2, d] = z[1] * r2 - z[2] * r1, z[2] * r0 - z[0] * r2, z[0] * r1 - z[1] * r0
+        for i in range(3):
+            J[3 + i, d] = z[i]
+    return x, turn, J
+
+
+@kernel
+def points_at(chain: Chain, link: I64, local: F64, q: F64) -> F64:
+    """Return the points (3, m) [m] at q (n,), a row a coordinate; link (m,), local (m, 3) [m]."""
+    n, m = q.shape[0], link.shape[0]
+    R, t, P = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3)), np.empty((3, m))
+    placements(chain, q, R, t)
+    for j in range(m):
+        k = link[j]
+        for i in range(3):
+            P[i, j] = t[k, i] + R[k, i, 0] * local[j, 0] + R[k, i, 1] * local[j, 1] + R[k, i, 2] * local[j, 2]
+    return P
+
+
+@kernel
+def _least(rho: F64) -> float:
+    least = np.inf
+    for k in range(rho.shape[0]):
+        for j in range(rho.shape[2]):
+            least = min(least, rho[k, 0, j])
+    return float(least)
+
+
+@kernel
+def clearances(
+    chain: Chain, link: I64, local: F64, radius: F64, Q: F64, obstacles: Obstacles, times: F64, cutoff: float
+) -> F64:
+    """Return the least distance (b,) [m] of the points to any obstacle, at postures Q (b, n).
+
+    times (b,) [s]: how far ahead each is; obstacles are moved on at their speeds. cutoff [m]: what is beyond it may be
+    less than true, never below it.
+    """
+    out, rho = np.empty(Q.shape[0]), np.empty((obstacles.active.shape[0], 4, radius.shape[0]))
+    for b in range(Q.shape[0]):
+        p, R = obstacles.p, obstacles.R
+        if times[b] != 0.0:
+            p, R = advanced_pose(obstacles.active, p, R, obstacles.v, obstacles.w, times[b])
+        at = Obstacles(
+            obstacles.kind,
+            obstacles.active,
+            R,
+            p,
+            obstacles.v,
+            obstacles.w,
+            obstacles.dims,
+            obstacles.group,
+            obstacles.margin,
+            obstacles.mesh,
+            obstacles.clouds,
+        )
+        distances_into(points_at(chain, link, local, Q[b]), radius, at, cutoff, rho)
+        out[b] = _least(rho)
+    return out
+
+
+@kernel
+def _damped_step(J: F64, e: F64, free: B1, damping: float) -> F64:
+    """Return J_f^T (J_f J_f^T + damping I)^-1 e, J_f the columns that are free (n,)."""
+    k, n = J.shape
+    G, step = np.zeros((k, k)), np.zeros(n)
+    for a in range(k):
+        for b in range(k):
+            for i in range(n):
+                if free[i]:
+                    G[a, b] += J[a, i] * J[b, i]
+        G[a, a] += damping
+    G_inv = spd_inverse(G)
+    for a in range(k):
+        y = 0.0
+        for b in range(k):
+            y += G_inv[a, b] * e[b]
+        for i in range(n):
+            if free[i]:
+                step[i] += J[a, i] * y
+    return step
+
+
+@kernel
+def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tuple[F64, bool]:
+    """Return a posture (n,) near q0 that has the goal within low and high (n,), and whether it has.
+
+    Damped least squares (Wampler 1986); a joint that a step takes against its bound is left out of it.
+    """
+    n = q0.shape[0]
+    q, R, t = np.minimum(np.maximum(q0, low), high), np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
+    for _ in range(STEPS):
+        placements(chain, q, R, t)
+        x, turn, J = tip_at(chain, R, t)
+        e, e_rot = task_error(goal.task, goal.axis, goal.position, goal.wxyz, x, turn)
+        far, turned = np.sqrt((e * e).sum()), np.sqrt((e_rot * e_rot).sum())
+        if far < REACHED and turned < 10.0 * REACHED:
+            return q, True
+        S = selection(goal.task, goal.axis, turn)
+        k = S.shape[0]
+        Js, es = np.zeros((k, n)), np.zeros(k)
+        for a in range(k):
+            for b in range(3):
+                es[a] += S[a, b] * e[b] + S[a, 3 + b] * e_rot[b]
+            for b in range(6):
+                for i in range(n):
+                    Js[a, i] += S[a, b] * J[b, i]
+        free = np.ones(n, np.bool_)
+        step = np.zeros(n)
+        for _again in range(3):
+            step = _damped_step(Js, es, free, 1e-5 + 1e-2 * (far * far + turned * turned))
+            bound = False
+            for i in range(n):
+                if free[i] and ((q[i] >= high[i] and step[i] > 0.0) or (q[i] <= low[i] and step[i] < 0.0)):
+                    free[i] = False
+                    bound = True
+            if not bound:
+                break
+        size = np.abs(step).max()
+        share = LARGEST / size if size > LARGEST else 1.0
+        for i in range(n):
+            q[i] = min(max(q[i] + share * step[i], low[i]), high[i])
+    return q, False
+
+
+@kernel
+def postures_of(chain: Chain, seeds: F64, goal: Target, low: F64, high: F64) -> tuple[F64, B1]:
+    """Return `posture_of` every seed (s, n): the postures (s, n) and which have the goal (s,)."""
+    out, has = np.empty_like(seeds), np.empty(seeds.shape[0], np.bool_)
+    for s in range(seeds.shape[0]):
+        out[s], has[s] = posture_of(chain, seeds[s], goal, low, high)
+    return out, has
+
+
+class Pace(NamedTuple):
+    """How fast the law goes to a goal."""
+
+    v: float  # [m/s]
+    w: float  # [rad/s]
+    qd: F64  # (n,) [rad/s] at most
+    drift: F64  # (n,) [rad/s] at most towards the posture
+    gain: float  # [1/s] of that
+
+
+@kernel
+def rollout(chain: Chain, q0: F64, rest: F64, goal: Target, low: F64, high: F64, pace: Pace, dt: float) -> F64:
+    """Return the postures (k, n), dt [s] apart, of a tip that goes straight to a goal and joints that drift to `rest`.
+
+    The law without obstacles and inertia, to see where it would end: within low and high (n,) all the same. The last
+    posture has the goal where k is not more than ROLLOUT.
+    """
+    n = q0.shape[0]
+    out, q, R, t = np.empty((ROLLOUT + 1, n)), q0.copy(), np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
+    for b in range(ROLLOUT + 1):
+        out[b] = q
+        placements(chain, q, R, t)
+        x, turn, J = tip_at(chain, R, t)
+        e, e_rot = task_error(goal.task, goal.axis, goal.position, goal.wxyz, x, turn)
+        far, turned = np.sqrt((e * e).sum()), np.sqrt((e_rot * e_rot).sum())
+        if far < NEAR_ENOUGH and turned < 5.0 * NEAR_ENOUGH:
+            return out[: b + 1].copy()
+        S = selection(goal.task, goal.axis, turn)
+        k = S.shape[0]
+        Js, es = np.zeros((k, n)), np.zeros(k)
+        e *= min(1.0, pace.v * dt / max(far, 1e-12))
+        e_rot *= min(1.0, pace.w * dt / max(turned, 1e-12))
+        for a in range(k):
+            for c in range(3):
+                es[a] += S[a, c] * e[c] + S[a, 3 + c] * e_rot[c]
+            for c in range(6):
+                for i in range(n):
+                    Js[a, i] += S[a, c] * J[c, i]
+        free, step = np.ones(n, np.bool_), np.zeros(n)
+        drift = np.minimum(np.maximum(pace.gain * (rest - q), -pace.drift), pace.drift) * dt
+        for _again in range(3):
+            wanted = es.copy()
+            for a in range(k):
+                for i in range(n):
+                    if free[i]:
+                        wanted[a] -= Js[a, i] * drift[i]
+            step = _damped_step(Js, wanted, free, 1e-4)
+            bound = False
+            for i in range(n):
+                step[i] = step[i] + drift[i] if free[i] else 0.0
+            for i in range(n):
+                if free[i] and ((q[i] >= high[i] and step[i] > 0.0) or (q[i] <= low[i] and step[i] < 0.0)):
+                    free[i] = False
+                    bound = True
+            if not bound:
+                break
+        share = 1.0
+        for i in range(n):
+            if abs(step[i]) * share > pace.qd[i] * dt:
+                share = pace.qd[i] * dt / abs(step[i])
+        for i in range(n):
+            q[i] = min(max(q[i] + share * step[i], min(low[i], q[i])), max(high[i], q[i]))
+    return out
+
+
+def clearance_of(chain: Chain, points: Points, Q: F64, obstacles: Obstacles, cutoff: float = np.inf) -> F64:
+    """Return `clearances` of postures (b, n) at the obstacles of now."""
+    still = np.zeros(len(Q))
+    return clearances(chain, points.link, points.local, points.radius, Q, obstacles, still, cutoff)

@@ -1,0 +1,83 @@
+"""Goals that an arm reaches beside what is near them, by pybullet: arrived, in time, never below the clearance."""
+
+from typing import NamedTuple
+
+import pytest
+
+from rtctl.app.sim import simulate_scenario
+from rtctl.plain import Json
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario
+from tests.lab import PANDA, ROOT
+
+CLEARANCE = 0.02  # [m] of configs/panda.toml
+HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
+DOWN = (0.0, 1.0, 0.0, 0.0)
+
+
+def balls(*at: tuple[float, float, float]) -> tuple[Json, ...]:
+    return tuple(
+        {"name": f"o{k}", "type": "sphere", "radius_m": 0.05, "position_m": position} for k, position in enumerate(at)
+    )
+
+
+class Case(NamedTuple):
+    goal: Json
+    obstacle: tuple[Json, ...]
+    within: float  # [s] of the goal
+    start: tuple[float, ...] = HOME
+    planner: bool = False
+
+
+COLUMNS = balls(*((0.52, side, z) for side in (-0.19, 0.19) for z in (0.15, 0.24, 0.33, 0.42, 0.51)))
+TABLE = {"name": "table", "type": "plane", "position_m": (0.0, 0.0, -0.02), "normal": (0.0, 0.0, 1.0)}
+MOVERS = (
+    {
+        "name": "c",
+        "type": "box",
+        "size_m": (0.436, 0.423, 0.387),
+        "wxyz": (0.305733003, 0.716571357, 0.505374205, 0.371011771),
+        "velocity_m_s": (-0.123, -0.087, 0.104),
+        "omega_rad_s": (0.266, 0.364, 0.372),
+        "position_m": (1.157, -0.354, -0.058),
+    },
+    {
+        "name": "b",
+        "type": "cylinder",
+        "radius_m": 0.041,
+        "length_m": 0.465,
+        "wxyz": (0.864066527, -0.089698098, 0.305892643, -0.389580517),
+        "position_m": (-0.32, -0.09, 0.511),
+    },
+)
+CASES = {
+    # the free motion takes 0.8 s: the hand's side is 30 mm from the ball at the goal
+    "a ball beside the goal": Case({"position_m": (0.5, 0.0, 0.35), "wxyz": DOWN}, balls((0.5, 0.182, 0.42)), 1.2),
+    "between two columns": Case({"position_m": (0.68, 0.0, 0.33), "wxyz": DOWN}, COLUMNS, 2.0),
+    "above a table": Case({"position_m": (0.5, 0.1, 0.03), "hold": "orientation"}, (TABLE,), 1.8),
+    "from a stretched arm": Case(
+        {"position_m": (0.45, 0.1, 0.5), "rpy_rad": (3.14159265, 0.0, 0.0)},
+        (),
+        2.2,
+        (0.0, 0.0, 0.0, -0.08, 0.0, 0.0, 0.0),
+    ),
+    "planned around a box that comes": Case(
+        {"position_m": (-0.245, 0.473, 0.345)},
+        MOVERS,
+        7.5,
+        (-1.653732, 1.31829, 0.879154, -0.521153, -1.921463, 3.605905, 0.264111),
+        planner=True,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance(name: str):
+    case = CASES[name]
+    goal = {"at_s": 0.3, **case.goal}
+    told: Json = {"robot": "panda", "start_q_rad": case.start, "goal": (goal,), "obstacle": case.obstacle}
+    scenario: Scenario = convert({**told, "duration_s": 0.3 + case.within, "planner": case.planner}, Scenario, name)
+    found = simulate_scenario(scenario, PANDA, ROOT / "configs" / "none.toml")
+    assert found["contacts"] == 0
+    assert found["min_clearance_m"]["all"] is None or found["min_clearance_m"]["all"] >= CLEARANCE
+    assert found["arrived"], found["goals"]

@@ -1,0 +1,230 @@
+"""Beside the servo: postures by Pinocchio, goals near obstacles by pybullet, advice in the log, the guide's process."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from rtctl.app.adviser import Adviser
+from rtctl.app.arm_link import first_feedback
+from rtctl.app.guide import Guide, Seen
+from rtctl.app.postures import endings, site_of
+from rtctl.app.replay import replay
+from rtctl.app.sim import simulate_scenario
+from rtctl.arm.field import Ends, MovingPoints, field_buffers, field_to
+from rtctl.arm.kinematics import chain_of, placements, points_at, tip_at
+from rtctl.arm.memory import MEASURED_POSTURE, Memory
+from rtctl.arm.pipe import initial
+from rtctl.kernel.rotations import quat_of
+from rtctl.log import schema
+from rtctl.log.read.run import read_run
+from rtctl.log.record.requests import decode_request, encode_request
+from rtctl.plain import Json
+from rtctl.spec.read import convert
+from rtctl.spec.scenario import Scenario
+from rtctl.types import Advice, Goal, ObstacleEdit, Request, Shape, State, Status, Task
+from rtctl.world.primitives import Obstacles, distances, obstacles_empty, with_shape
+from tests.lab import PANDA, ROOT, lab, robot
+
+HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+DOWN = (0.0, 1.0, 0.0, 0.0)
+UNIT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def ball(at: np.ndarray, radius: float = 0.05) -> Shape:
+    return Shape("ball", "sphere", np.array([radius, 0, 0, 0]), at, UNIT, np.zeros(3), np.zeros(3))
+
+
+def around(*shapes: Shape) -> Obstacles:
+    table = obstacles_empty(robot().slots)
+    for k, shape in enumerate(shapes):
+        table = with_shape(table, k, shape)
+    return table
+
+
+def test_compiled_kinematics_are_pinocchio_s():
+    arm = robot()
+    chain, n = chain_of(arm.body), arm.n
+    model, data = arm.body.model, arm.body.model.createData()
+    R, t = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
+    for q in np.random.default_rng(0).uniform(arm.q_min, arm.q_max, (10, n)):
+        pin.computeJointJacobians(model, data, q)
+        pin.updateFramePlacements(model, data)
+        frame = model.getFrameId("panda_hand_tcp")
+        placements(chain, q, R, t)
+        x, turn, J = tip_at(chain, R, t)
+        np.testing.assert_allclose(x, data.oMf[frame].translation, atol=1e-12)
+        np.testing.assert_allclose(turn, data.oMf[frame].rotation, atol=1e-12)
+        wanted = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        np.testing.assert_allclose(J, wanted, atol=1e-12)
+        np.testing.assert_allclose(
+            points_at(chain, arm.points.link, arm.points.local, q).T, arm.body.placed(q, arm.points), atol=1e-12
+        )
+
+
+def test_postures_of_a_goal_have_it_within_limits_and_clear():
+    arm = robot()
+    goal = Goal(np.array([0.5, 0.1, 0.3]), np.array(DOWN), Task.POSE, 0.003, 0.015)
+    data = arm.body.model.createData()
+    obstacles = around(ball(np.array([0.5, 0.3, 0.4])))
+    found = endings(site_of(arm, obstacles, np.array(HOME)), goal, 0)
+    assert len(found) >= 2
+    for end in found:
+        pin.framesForwardKinematics(arm.body.model, data, end.q)
+        tip = data.oMf[arm.body.model.getFrameId("panda_hand_tcp")]
+        np.testing.assert_allclose(tip.translation, goal.position, atol=2e-4)
+        assert abs(quat_of(np.array(tip.rotation)) @ goal.wxyz) > 1.0 - 1e-6
+        assert ((arm.q_min < end.q) & (end.q < arm.q_max)).all()
+        rho, _ = distances(arm.body.placed(end.q, arm.points), arm.points.radius, obstacles)
+        assert rho.min() == pytest.approx(end.rho)
+        assert end.rho > 0.0
+
+
+def test_the_whole_potential_has_its_minimum_at_the_goal():
+    """At the goal no push, however near what rests is; beside it less than what draws the point there."""
+    arm, q = robot(), np.array(HOME)
+    model = arm.body.evaluate(q, np.zeros(7), arm.points)
+    j = int(np.argmax(model.P[:, 2] * (arm.points.link == 7)))
+    at = model.P[j] + np.array([0.0, 1.0, 0.0]) * (arm.points.radius[j] + 0.05 + 0.03)
+    for _ in range(30):  # 30 mm from the nearest point
+        obstacles = around(ball(at))
+        rho, _ = distances(model.P, arm.points.radius, obstacles)
+        at[1] += 0.03 - rho.min()
+    points = MovingPoints(model.P, model.Jp, model.B, arm.points.radius, arm.points.link)
+    out, still = field_buffers(arm.slots, len(model.P), 7), np.zeros(7)
+    ends = Ends(model.P.copy(), rho.copy(), 1.05 * arm.avoid.rho_min)
+    assert rho.min() == pytest.approx(0.03, abs=1e-3)
+
+    def push(dq: np.ndarray, goal: Ends) -> np.ndarray:
+        field_to(points, dq, still, obstacles, arm.avoid, out, True, True, goal)
+        return out.tau.copy()
+
+    nowhere = Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0)
+    assert np.abs(push(still, nowhere)).max() > 1.0
+    assert np.abs(push(still, ends)).max() == 0.0
+    for dq in 0.01 * np.random.default_rng(1).standard_normal((50, 7)):
+        # acceleration of a spring k_p towards the goal, in the metric of A, against that of the field
+        drawn, pushed = arm.motion.k_p * dq @ model.A @ dq, push(dq, ends) @ dq
+        assert pushed < drawn
+    at[1] -= 0.03 - rho.min()
+    moving = ball(at)._replace(velocity=np.array([0.0, 0.01, 0.0]))  # away from it: no wider for that
+    obstacles = around(moving)
+    assert np.abs(push(still, ends)).max() > 1.0  # what moves keeps its whole influence
+
+
+def played(log: Path | None = None, **tables: object) -> Json:
+    scenario: Scenario = convert({"robot": "panda", "start_q_rad": HOME, **tables}, Scenario, "scenario")
+    return simulate_scenario(scenario, PANDA, ROOT / "configs" / "none.toml", log)
+
+
+def test_a_tool_turns_the_way_that_its_joints_can_and_the_log_replays_to_the_bit(tmp_path):
+    log = tmp_path / "turn.mcap"
+    goal = {"at_s": 0.3, "position_m": (0.4, 0.0, 0.45), "rpy_rad": (3.14159265, 0.0, -2.9)}
+    found = played(log, duration_s=3.6, goal=(goal,))
+    assert found["arrived"]
+    run = read_run(log)
+    asked = [decode_request(raw)[1].advice for raw in run[schema.REQUEST].payloads]
+    assert any(each is not None for each in asked)
+    again = replay(run)
+    assert again.identical
+    assert again.digest == found["digest"]
+
+
+def test_advice_comes_back_from_the_log_to_the_bit():
+    advice = Advice(np.random.default_rng(0).uniform(-1.0, 1.0, 7), True, True)
+    _, asked = decode_request(encode_request(3, Request(advice=advice)))
+    assert asked.advice is not None
+    assert asked.advice.posture.tobytes() == advice.posture.tobytes()
+    assert (asked.advice.leads, asked.advice.clear) == (True, True)
+
+
+def seen(q: list[float], goal: Goal, *shapes: Shape, tick: int = 0, status: Status = Status.MOVING) -> Seen:
+    used = len(shapes)
+    o = around(*shapes)
+    cut = o._replace(**{k: getattr(o, k)[:used] for k in o._fields[:9]})
+    return Seen(tick, State.RUN, status, goal, np.array(q), cut)
+
+
+def test_a_goal_that_the_tip_reaches_by_itself_needs_no_advice():
+    guide = Guide(robot(), plans=True)
+    guide.begin()
+    goal = Goal(np.array([0.45, 0.1, 0.45]), UNIT, Task.POSITION, 0.003, 0.015)
+    assert all(guide.advise(seen(HOME, goal, tick=k)) is None for k in range(30))
+
+
+def test_a_way_is_left_to_what_will_cross_it_and_taken_again():
+    guide = Guide(robot(), plans=True, at_once=True)
+    guide.begin()
+    goal = Goal(np.array([0.5, 0.3, 0.4]), np.array(DOWN), Task.POSE, 0.003, 0.015)
+    led = guide.advise(seen(HOME, goal))
+    assert led is not None
+    assert led.leads
+    comes = ball(np.array([0.65, 0.1, 0.45]))._replace(velocity=np.array([-0.3, 0.0, 0.0]))
+    advice = guide.advise(seen(HOME, goal, comes, tick=100))
+    assert guide.events[-1][0] == "yields"
+    assert advice is not None
+    assert np.abs(advice.posture - HOME).max() < np.abs(led.posture - HOME).max()
+    gone = guide.advise(seen(HOME, goal, tick=200))
+    assert gone is not None
+    assert np.abs(gone.posture - HOME).max() > 0.05
+
+
+def held(m: Memory, tick: int) -> Memory:
+    """Return a memory of an arm that is held in a limit, the tool still to be turned."""
+    goal = Goal(np.array([0.4, 0.0, 0.45]), np.array([0.0, 0.9926, 0.1208, 0.0]), Task.POSE, 0.003, 0.015)
+    return m._replace(tick=tick, state=State.RUN, status=Status.LIMITED, goal=goal)
+
+
+def test_the_process_advises_is_never_waited_for_and_ends():
+    arm = robot()
+    adviser = Adviser(arm)
+    try:
+        assert adviser.pid != os.getpid()
+        m = initial(arm, first_feedback(np.array(HOME)))
+        adviser.begin()
+        for tick in range(0, 100_000, 10):
+            advice = adviser.advise(held(m, tick))
+            if advice is not None:
+                break
+            time.sleep(0.01)
+        assert advice is not None
+        assert advice.posture.shape == (7,)
+
+        os.kill(adviser.pid, signal.SIGSTOP)  # it hangs: what is shown piles up, and nobody waits
+        for tick in range(0, 20_000, 10):
+            adviser.advise(held(m, tick))
+        adviser.begin()
+        assert adviser.advise(held(m, 0)) is None  # what was said of the other goal is dropped
+
+        os.kill(adviser.pid, signal.SIGKILL)
+        os.waitpid(adviser.pid, 0)
+        adviser.events.clear()
+        while not adviser.events:
+            assert adviser.advise(held(m, 0)) is None
+        assert [name for name, _ in adviser.events] == ["no_guide"]
+    finally:
+        adviser.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(adviser.pid, 0)
+
+
+def test_a_posture_measured_among_other_obstacles_is_not_trusted_beside_a_new_one():
+    arm = robot()
+    with lab() as here:
+        here.running()
+        here.ask([0.45, 0.1, 0.45])
+        here.step(Request(advice=Advice(np.array(HOME), clear=True)))
+        assert here.memory.has_posture == MEASURED_POSTURE
+        comes = ball(np.array([0.6, 0.6, 0.6]))._replace(velocity=np.array([0.1, 0.0, 0.0]))
+        here.step(Request(obstacles=(ObstacleEdit("ball", comes),)))
+        assert here.memory.has_posture == MEASURED_POSTURE
+        here.step(Request(obstacles=(ObstacleEdit("ball", ball(np.array([0.6, 0.6, 0.6]))),)))
+        assert here.memory.has_posture == 1
+        here.step(Request(advice=Advice(np.full(arm.n, 9.0))))  # beyond the limits: nobody asked for it, nobody is told
+        assert not here.memory.refusal
+        assert here.memory.goal is not None
+        np.testing.assert_array_equal(here.memory.goal.posture, HOME)
