@@ -10,6 +10,8 @@
 # make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
 # make soak    a rover for a day of its own time: rate, memory and queues; some hours
 # make docs    the site of documents, into out/site
+# make pictures    every picture of docs anew, and the numbers that their captions name
+# make wheels      the wheel in clean environments of Python 3.11 to 3.13
 # make lock    resolve requirements.lock anew from pyproject.toml
 
 PYTHON ?= python3
@@ -22,7 +24,7 @@ PYTEST_FLAGS ?=
 WORKERS ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-rover test lint bench benchmark stress mutants docs fuzz ordeal soak install lock clean
+.PHONY: demo demo-rover test lint bench benchmark stress mutants docs pictures wheels fuzz ordeal soak install lock clean
 
 demo: install
 	$(BIN)/python -m tools.demo
@@ -62,6 +64,12 @@ soak: install
 
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+pictures: install
+	$(BIN)/python -m tools.pictures
+
+wheels: install
+	$(BIN)/python -m tools.wheels --sim
 
 install: $(INSTALLED) $(SYSTEM) $(WARM)
 

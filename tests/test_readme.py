@@ -1,5 +1,7 @@
 """README and the pages of docs say what the program does."""
 
+import hashlib
+import json
 import re
 from importlib import util
 from pathlib import Path
@@ -7,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rtctl.cli import main
-from tools import site
+from tools import arms, site
 from tools.faults import PAGES, with_table
 
 ROOT = Path(__file__).parents[1]
@@ -71,3 +73,34 @@ def test_every_command_they_show_exists(capsys):
             main([verb, "--help"])
         assert stop.value.code == 0, verb
     assert "usage" in capsys.readouterr().out
+
+
+def test_captions_name_the_numbers_of_their_own_pictures():
+    """Of the run that is drawn, as `make pictures` wrote them down beside the picture."""
+    notes = json.loads((ROOT / "docs" / "pictures.json").read_text(encoding="utf-8"))
+    pages = {page: page.read_text(encoding="utf-8") for page in DOCUMENTS}
+    assert set(notes) == {path.name for path in (ROOT / "docs").glob("*.png")}
+    for name, note in notes.items():
+        picture = (ROOT / "docs" / name).read_bytes()
+        assert hashlib.sha256(picture).hexdigest() == note["sha256"], f"{name} is not the picture of these numbers"
+        captions = [
+            " ".join(caption.split())
+            for text in pages.values()
+            for caption in re.findall(rf"!\[([^\]]*)\]\((?:docs/)?{re.escape(name)}\)", text)
+        ]
+        assert captions, f"{name} is not shown"
+        for caption in captions:
+            assert all(phrase in caption for phrase in note["says"]) or not re.search(r"\d", caption), (name, note)
+        said = " ".join(captions)
+        assert all(phrase in said for phrase in note["says"]), (name, note["says"])
+
+
+def test_the_table_of_arms_is_of_the_arms_that_the_tool_takes():
+    rows = [arms.cells(row) for row in arms.PAGE.read_text(encoding="utf-8").splitlines() if row.startswith("| ")][1:]
+    names = [case.name for case in arms.CASES]
+    assert [row[0] for row in rows] == [name for name in names if name in {row[0] for row in rows}]
+    assert all(len(row) == 11 for row in rows)
+    reached = [row for row in rows if row[8:10] == ["2 of 2", "0"] and int(row[10]) > 0]
+    assert f"{len(reached)} of {len(rows)} arms" in arms.PAGE.read_text(encoding="utf-8")
+    for row in rows:
+        assert row[4] or row in reached, row[0]  # what did not work says why

@@ -1,12 +1,14 @@
 """Twenty-five arms and more of the packages that carry robots, each through init, check and a simulation.
 
 `python -m tools.arms` prints the table of docs/arms.md: what each needed, what was refused, whether both goals were
-reached without a touch, by the simulated arm's truth. It needs the extra `robots`. `--write` writes the page.
+reached without a touch, by the simulated arm's truth. It needs the extra `robots`. `--write` renews
+the page's rows of the arms that were run.
 """
 
 import argparse
 import contextlib
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -123,13 +125,13 @@ def go(arm: Case, folder: Path) -> Row:
     code, out, err, init = rtctl("init", arm.robot, "--out", str(folder), "--name", name, *arm.options)
     row = Row(arm, arm.robot.rpartition("/")[2], "", "", (init, 0.0, 0.0), "", "", "", False)
     if code:
-        return row._replace(said=_last(err))
+        return row._replace(said=_last(err, folder))
     told = [line.strip() for line in out.splitlines() if line.startswith("  ")]
     row = row._replace(joints=out.split(" joints, from")[0].rpartition(" ")[2], said="; ".join(told))
     code, _, err, check = rtctl("check", str(folder / f"{name}.toml"))
     row = row._replace(seconds=(init, check, 0.0))
     if code:
-        return row._replace(said=_last(err))
+        return row._replace(said=_last(err, folder))
     scenario = folder / f"{name}_first.toml"
     if not scenario.exists():
         return row
@@ -138,7 +140,7 @@ def go(arm: Case, folder: Path) -> Row:
     try:
         figures: Json = json.loads(out)
     except ValueError:
-        return row._replace(said=_last(err))
+        return row._replace(said=_last(err, folder))
     reached = sum(goal["arrived"] for goal in figures["goals"])
     nearest = figures["min_clearance_m"].get("all")
     ball = "ball" in figures["min_clearance_m"]
@@ -151,8 +153,12 @@ def go(arm: Case, folder: Path) -> Row:
     )
 
 
-def _last(err: str) -> str:
-    return err.strip().splitlines()[-1].removeprefix("rtctl: ") if err.strip() else "ended without a word"
+def _last(err: str, folder: Path) -> str:
+    """Return the last line of what was said, with no place of this machine in it."""
+    if not err.strip():
+        return "ended without a word"
+    said = err.strip().splitlines()[-1].removeprefix("rtctl: ").replace(f"{folder}/", "")
+    return re.sub(r"\S*/site-packages/", "", said)
 
 
 def line(row: Row) -> str:
@@ -177,7 +183,7 @@ def run() -> int:
     """Take the arms through, print the table; return 0 when 25 or more did all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("names", metavar="ARM", nargs="*", help="parts of names; default: all")
-    parser.add_argument("--write", action="store_true", help="write docs/arms.md too")
+    parser.add_argument("--write", action="store_true", help="renew these rows of docs/arms.md")
     parser.add_argument("--keep", metavar="DIR", default="", help="keep the files here")
     arguments = parser.parse_args()
     wanted = [c for c in CASES if not arguments.names or any(n.lower() in c.name.lower() for n in arguments.names)]
@@ -187,11 +193,31 @@ def run() -> int:
             rows.append(go(arm, folder))
             print(line(rows[-1]), flush=True)
     done = sum(row.done for row in rows)
-    foot = f"\n{done} of {len(rows)} arms reached both goals beside the ball without a touch or a fault.\n"
-    print(foot)
+    print(f"\n{done} of {len(rows)} arms reached both goals beside the ball without a touch or a fault.\n")
     if arguments.write:
-        PAGE.write_text(HEAD + "\n".join(map(line, rows)) + "\n" + foot, encoding="utf-8")
+        write(list(map(line, rows)))
     return 0 if done >= min(25, len(wanted)) else 1
+
+
+def write(lines: list[str]) -> None:
+    """Write the page: these rows, and of the page as it is those of other arms."""
+    known = {cells(row)[0]: row for row in PAGE.read_text(encoding="utf-8").splitlines()} if PAGE.exists() else {}
+    known |= {cells(row)[0]: row for row in lines}
+    kept = [known[arm.name] for arm in CASES if arm.name in known]
+    done = sum(is_done(row) for row in kept)
+    foot = f"\n{done} of {len(kept)} arms reached both goals beside the ball without a touch or a fault.\n"
+    PAGE.write_text(HEAD + "\n".join(kept) + "\n" + foot, encoding="utf-8")
+
+
+def cells(row: str) -> list[str]:
+    """Return the cells of a row of the page."""
+    return [cell.strip() for cell in row.strip().strip("|").split("|")]
+
+
+def is_done(row: str) -> bool:
+    """Return whether a row of the page says that its arm did all."""
+    *_, goals, contacts, nearest = cells(row)
+    return goals == "2 of 2" and contacts == "0" and bool(nearest) and "no ball" not in row
 
 
 if __name__ == "__main__":

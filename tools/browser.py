@@ -177,6 +177,10 @@ class Browser:
         return [entry["message"] for entry in found if entry["level"] in ("SEVERE", "WARNING")]
 
     def picture(self, path: Path) -> None:
-        """Keep what is on the screen. The standard's own way gives a page ten seconds, too few in software."""
-        shot = {"cmd": "Page.captureScreenshot", "params": {"format": "png"}}
-        path.write_bytes(base64.b64decode(self._ask("POST", "/goog/cdp/execute", shot)["data"]))
+        """Keep what is on the screen."""
+        try:
+            shot = self._ask("GET", "/screenshot")
+        except AssertionError:  # it gives a page ten seconds, which is too few for one that is drawn in software
+            wanted = {"cmd": "Page.captureScreenshot", "params": {"format": "png"}}
+            shot = self._ask("POST", "/goog/cdp/execute", wanted)["data"]
+        path.write_bytes(base64.b64decode(shot))

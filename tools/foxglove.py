@@ -16,6 +16,7 @@ import sys
 import tarfile
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -148,7 +149,7 @@ def look(site: Path, log: Path, layout: Path, at: float, wait: float, png: Path)
     return topics, problems
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Look at a log; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.foxglove", description="A log as Foxglove shows it.")
     parser.add_argument("log", type=Path)
@@ -157,7 +158,7 @@ def main() -> int:
     parser.add_argument("--wait", type=float, default=40.0, metavar="S", help="until it has read it (%(default)s)")
     parser.add_argument("--png", type=Path, default=Path("out/foxglove.png"), help="(%(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("out/foxglove"), help="for the packages (%(default)s)")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     absent = [f"{path}: no such file" for path in (arguments.log, arguments.layout) if not path.is_file()]
     lacking = "; ".join(absent) or missing() or ("" if shutil.which("npm") else "npm: apt-get install -y npm")
     if lacking:

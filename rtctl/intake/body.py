@@ -34,6 +34,7 @@ TIPS = (
     "flange",
     "hand",
 )
+HAIR = 1e-6  # share by which a largest moment of inertia stays below the sum of the others
 TURN = 6.28  # [rad] each way of a joint without limits
 RANGE = 3.1  # [rad] each way of a joint whose description has no range
 
@@ -334,6 +335,19 @@ def _tip(robot: Described, end: int, told: list[str]) -> str:
         chosen = max(bodies, key=lambda f: float(np.linalg.norm(f.placement.translation)))
     told.append(f"the tip is {chosen.name}; --tip FRAME for another")
     return str(chosen.name)
+
+
+def within(inertia: pin.Inertia) -> pin.Inertia:
+    """Return a possible inertia a hair within what a body can have, for physics engines that take it to the last digit.
+
+    Published identifications are often cut off at the very bound: their largest moment is the sum of the others.
+    """
+    moments, axes = np.linalg.eigh(np.array(inertia.inertia))
+    most = (1.0 - HAIR) * (moments[0] + moments[1])
+    if moments[2] <= most:
+        return inertia
+    moments[2] = most
+    return pin.Inertia(inertia.mass, np.array(inertia.lever), axes @ np.diag(moments) @ axes.T)
 
 
 def impossible(inertia: pin.Inertia) -> str:

@@ -14,7 +14,7 @@ from rtctl.design.arm import no_points
 from rtctl.errors import ConfigError
 from rtctl.intake import drives as drive_table
 from rtctl.intake import text, urdf
-from rtctl.intake.body import Arm, Asked, Joint, describe, impossible, take
+from rtctl.intake.body import Arm, Asked, Joint, describe, impossible, take, within
 from rtctl.intake.choose import Place, beside, floor_of, home_of, place_of, ways
 from rtctl.intake.shapes import Piece, pieces, volume
 from rtctl.intake.sources import IntakeError, Source
@@ -74,6 +74,7 @@ def _check_inertias(arm: Arm, solid: Sequence[Piece], told: list[str], repair: b
     for j in range(1, arm.model.njoints):
         why = impossible(arm.model.inertias[j])
         if not why:
+            arm.model.inertias[j] = within(arm.model.inertias[j])
             continue
         name = arm.model.names[j]
         if not repair:

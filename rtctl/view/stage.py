@@ -131,7 +131,7 @@ class Stage:
         """
         if self.body is not None:
             whence, reach = FROM, self.body.reach()
-            centre, size = self.body.base[:3, 3] + reach * np.array([0.22, 0.0, 0.33]), SIZE * reach
+            centre, size = self.body.base[:3, 3] + reach * np.array([0.22, 0.0, 0.37]), SIZE * reach
         else:
             whence, goal = ABOVE, self._goal_now if all_of_it and self._goal_now is not None else self._place
             centre, size = 0.5 * (self._place + goal), BASE_SIZE + 0.5 * float(np.linalg.norm(goal - self._place))
