@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from ompl import base, geometric, util
 
-from rtctl.app.postures import Ending, Site, along, endings, site_of
+from rtctl.app.postures import SEEDS, Ending, Site, along, endings, site_of
 from rtctl.arm.freedom import Body, Room, body_of, first_blocked
 from rtctl.arm.kinematics import clearance_of
 from rtctl.arm.model import Model
@@ -27,10 +27,11 @@ from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Goal, Task
 from rtctl.world.primitives import Obstacles
 
-ROOM = (1.0, 0.65, 0.4, 0.25)  # fractions of influence and limit zone that a path keeps, tried in this order
+ROOM = (1.0, 0.65, 0.4, 0.25, 0.0)  # fractions of influence and limit zone that a path keeps, tried in this order
 EDGE = 0.06  # [rad] between two checked postures of an edge
 FINE = 0.015  # [rad] between those of the finished path
 BETWEEN = 0.8  # fraction of the room that a finished path has between the postures of its edges
+HARDER = 6  # times as many starts and edges, in the last of these steps
 CHECKS = 1500  # edges looked at, a step of ROOM
 WITHIN = 60.0  # [s]; a plan that takes longer depends on the machine
 NEAREST = 0.8  # of the field's clearance that a goal posture should have
@@ -67,16 +68,17 @@ def plan_joints(site: Site, goal: Goal, seed: int, checks: int = CHECKS, within:
     end, why = time.monotonic() + within, ""
     util.noOutputHandler()
     for share in ROOM:
-        ends, why = _goal_postures(site, goal, share, seed)
+        harder = 1 if share else HARDER
+        ends, why = _goal_postures(site, goal, share, seed, harder * SEEDS)
         free = _Free(site, share, ends)
-        path = _searched(site, ends, free, seed, partial(_spent, free, checks, end))
+        path = _searched(site, ends, free, seed, partial(_spent, free, harder * checks, end))
         if path is not None:
             path = _shortened(path, free, rng)
             if free.along(path, FINE, BETWEEN):
                 return path
         if time.monotonic() > end:
             raise PlanError(f"plan: no path to {_text(goal)} found in {within:g} s")
-    raise PlanError(why or f"plan: no path to {_text(goal)} found in {checks} edges a try")
+    raise PlanError(why or f"plan: no path to {_text(goal)} found in {HARDER * checks} edges")
 
 
 def sub_goals(robot: Robot, path: F64, goal: Goal) -> list[Goal]:
@@ -244,12 +246,12 @@ def _resampled(path: F64, step: float) -> F64:
 # -- postures that have the goal -------------------------------------------------------------------------------------
 
 
-def _goal_postures(site: Site, goal: Goal, share: float, seed: int) -> tuple[list[F64], str]:
+def _goal_postures(site: Site, goal: Goal, share: float, seed: int, seeds: int) -> tuple[list[F64], str]:
     """Return free postures that have the goal, the best first, and why there are none ('' when there are).
 
     Those with a clearance to spare come alone, where there are some.
     """
-    found: list[Ending] = endings(site, goal, seed, share)
+    found: list[Ending] = endings(site, goal, seed, share, seeds)
     if not found:
         nothing = site.obstacles._replace(active=np.zeros_like(site.obstacles.active))
         if endings(site._replace(obstacles=nothing), goal, seed, 0.0):

@@ -23,6 +23,7 @@ SEEDS = 48  # random starts
 ENDS = 8  # postures returned at most
 ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
+HAIR = 0.2  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
@@ -79,10 +80,11 @@ def site_of(robot: Robot, obstacles: Obstacles, start: F64) -> Site:
 def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = SEEDS) -> list[Ending]:
     """Return postures that have the goal and touch nothing, the best first; none where none is found.
 
-    zone: share of the zones of joint limits that they keep free of; the clearance at least, unless the start does not.
+    zone: share of the zones of joint limits that they keep free of, and more than their clearance, if the start does;
+    0: none but HAIR of that, for a goal that is nowhere else to be had.
     """
     robot = site.robot
-    margin = np.maximum(zone * robot.limit.rho0, 1.5 * robot.limit.rho_min)
+    margin = np.maximum(zone * robot.limit.rho0, 1.5 * robot.limit.rho_min) if zone else HAIR * robot.limit.rho_min
     low, high = np.minimum(robot.q_min + margin, site.start), np.maximum(robot.q_max - margin, site.start)
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[site.start, robot.q_rest, robot.home], rng.uniform(low, high, (seeds, robot.n))])

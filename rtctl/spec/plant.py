@@ -73,6 +73,7 @@ class PlantTable(Table, frozen=True, kw_only=True):
         Annotated[
             str,
             Meta(
+                min_length=1,
                 max_length=4096,
                 description="MJCF that moves in the place of the URDF: a path beside the robot file, or package://",
             ),

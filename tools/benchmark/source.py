@@ -33,11 +33,13 @@ GRASPED = 0.003  # [m]
 NEAR, TURNED = 0.005, 0.02  # [m], [rad]
 GOAL_AT = 0.3  # [s]
 LASTS = 20.0  # [s] within which it must arrive
-# Shelves and boxes leave the hand less than the shipped files' 20 mm; slower, for the shorter influence.
-CLEARANCE, INFLUENCE, SPEED = 0.008, 0.05, 0.3  # [m], [m], [m/s]
+# Shelves and boxes leave the hand less than the shipped files' 20 mm, and their points stand out of links too far;
+# slower, for the shorter influence.
+CLEARANCE, INFLUENCE, SPEED, OVERHANG = 0.008, 0.05, 0.3, 0.015  # [m], [m], [m/s], [m]
 CONFIG: dict[tuple[str, ...], object] = {
     ("avoid", "clearance_m"): CLEARANCE,
     ("avoid", "influence_m"): INFLUENCE,
+    ("avoid", "overhang_m"): OVERHANG,
     ("motion", "v_max_m_s"): SPEED,
 }
 FRAMES = {"panda": "panda_link0", "ur5": "base_link"}  # that the obstacles are given in
