@@ -1,0 +1,69 @@
+"""The campaign of stops plays every fault with every kind of brakes on every arm, and its judge is not blind."""
+
+from collections.abc import Callable
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from rtctl.campaign.case import Asked
+from rtctl.types import F64, Truth
+from tests.lab import ROOT, robot
+from tools.stop_campaign import ARMS, BRAKES, KINDS, source
+from tools.stop_judge import Course, Run, judged
+
+PLANAR = robot(ROOT / "configs" / "planar4.toml")
+DT, N = 0.01, 40
+Ways = Callable[[F64], F64]  # of the times (T,) [s]
+
+
+def test_every_fault_is_played_on_every_arm_with_every_kind_of_brakes() -> None:
+    whole = len(ARMS) * len(KINDS) * len(BRAKES)
+    found = list(islice(source.cases(Asked((), range(1), whole, {})), whole + 1))
+    assert len(found) == whole == len({(case.robot, case.set) for case in found})
+    assert {case.set for case in found} == {f"{kind} {brakes}" for kind in KINDS for brakes in BRAKES}
+    without = [case for case in found if case.set.endswith("none")]
+    assert not any("brake = true" in case.config for case in without)
+
+
+def judge(brakes: str, kind: str, speeds: dict[int, Ways], joint: int = 1, at: float = 1.0) -> Run:
+    """Return the judgement of a course on the level arm, whose joints have the speeds that are given."""
+    t = np.arange(N) * DT
+    qd = np.zeros((N, PLANAR.n))
+    for j, speed in speeds.items():
+        qd[:, j] = speed(t)
+    q = PLANAR.home + np.vstack([np.zeros(PLANAR.n), np.cumsum(qd[1:] * DT, axis=0)])
+    course = Course(at)
+    for k in range(N):
+        tip = PLANAR.body.evaluate(q[k], np.zeros(PLANAR.n), PLANAR.points, PLANAR.own).x.copy()
+        course.rows.append(Truth(at + t[k], q[k], qd[k], np.zeros(PLANAR.n), tip, np.zeros(4), {}, 1.0, 0))
+    return judged(PLANAR, course, None, (kind, joint, at), brakes)
+
+
+def still(t: F64) -> F64:
+    return np.zeros(len(t))
+
+
+@pytest.mark.parametrize("brakes", BRAKES)
+def test_an_arm_that_stays_breaks_nothing(brakes: str) -> None:
+    assert judge(brakes, "drive_fault", {0: still}).broken == ()
+
+
+def test_one_that_is_driven_on_is_seen() -> None:
+    assert any("faster" in text for text in judge("ideal", "weak", {1: lambda t: 2.0 * t}).broken)
+    assert any("held" in text for text in judge("none", "silent", {1: lambda t: 2.0 * t}).broken)
+    assert any("held" in text for text in judge("none", "drive_fault", {2: lambda t: 2.0 * t}).broken)
+    assert any("way" in text for text in judge("slipping", "weak", {0: lambda t: 0.2 + 0.0 * t}).broken)
+
+
+def test_a_joint_that_nothing_drives_may_go_on_on_a_level_arm_but_not_gather_speed() -> None:
+    """Nothing pulls there: by itself it goes at the speed that it had, all others locked."""
+    assert judge("none", "stuck_encoder", {1: lambda t: 0.5 + 0.0 * t}).falls == pytest.approx(0.2 / 0.25, abs=0.05)
+    driven = judge("none", "stuck_encoder", {1: lambda t: 0.5 + 3.0 * t})
+    assert any("free fall" in text for text in driven.broken)
+
+
+def test_a_joint_that_is_held_may_not_pass_its_limit_and_one_that_falls_may() -> None:
+    over = float((PLANAR.q_max - PLANAR.home)[1]) / (N * DT) * 1.2
+    assert any("limit" in text for text in judge("none", "silent", {1: lambda t: over + 0.0 * t}).broken)
+    assert not any("limit" in text for text in judge("none", "drive_fault", {1: lambda t: over + 0.0 * t}).broken)
