@@ -72,7 +72,7 @@ class Tap:
     def _listen(self) -> None:
         while True:
             ready = select.select([self._stopped, self.socket], [], [])[0]
-            if self._stopped in ready:
+            if self.socket not in ready:  # it is told to stop, and has written down all that came before
                 return
             try:
                 raw = self.socket.recv(80)
