@@ -12,10 +12,12 @@ import pytest
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
-from rtctl.app.postures import endings, site_of
+from rtctl.app.postures import endings, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
+from rtctl.app.simulator import open_simulator
 from rtctl.arm.field import Ends, MovingPoints, field_buffers, field_to
+from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, placements, points_at, tip_at
 from rtctl.arm.memory import MEASURED_POSTURE, Memory
 from rtctl.arm.pipe import initial
@@ -140,6 +142,32 @@ def test_advice_comes_back_from_the_log_to_the_bit():
     assert asked.advice is not None
     assert asked.advice.posture.tobytes() == advice.posture.tobytes()
     assert (asked.advice.leads, asked.advice.clear) == (True, True)
+
+
+def test_where_points_stand_out_too_far_the_links_themselves_are_measured():
+    """Free means that pybullet finds the clearance, and who has it, and twice the skin to spare, is free."""
+    arm, rng = robot(), np.random.default_rng(3)
+    keep, anchors = arm.avoid.rho_min, np.zeros((0, 7))
+    coarse, fine = body_of(arm), body_of(arm, skin_of(arm.body))
+    room = Room(1.2 * keep, 0.0, anchors, np.zeros((0, 2)))
+    told: Json = {"robot": "panda", "duration_s": 1.0, "start_q_rad": HOME}
+    gained = 0
+    for k in range(12):
+        P = arm.body.placed(np.array(HOME), arm.points)
+        j = int(rng.integers(20, len(P)))
+        way = rng.standard_normal(3)
+        at = P[j] + way / np.linalg.norm(way) * (arm.points.radius[j] + 0.05 + rng.uniform(0.0, 0.03))
+        stands = {"name": "ball", "type": "sphere", "radius_m": 0.05, "position_m": at.tolist()}
+        scenario: Scenario = convert({**told, "obstacle": (stands,)}, Scenario, str(k))
+        simulator = open_simulator(PANDA, scenario, ROOT / "configs" / "none.toml")
+        true = simulator.truth().clearance["ball"]
+        simulator.close()
+        site = site_of(arm, around(ball(at)), np.array(HOME))
+        is_free = [first_blocked(body, site.start[None], site.obstacles, room, 1.0) < 0 for body in (coarse, fine)]
+        assert not is_free[1] or true >= keep - 1e-4
+        assert is_free[1] or true < keep + 0.01
+        gained += is_free[1] and not is_free[0]
+    assert gained > 0
 
 
 def seen(q: list[float], goal: Goal, *shapes: Shape, tick: int = 0, status: Status = Status.MOVING) -> Seen:

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from ompl import base, geometric, util
 
-from rtctl.app.postures import SEEDS, Ending, Site, along, endings, site_of
+from rtctl.app.postures import SEEDS, Ending, Site, along, endings, site_of, skin_of
 from rtctl.arm.freedom import Body, Room, body_of, first_blocked
 from rtctl.arm.kinematics import clearance_of
 from rtctl.arm.model import Model
@@ -127,7 +127,7 @@ class _Free:
         anchors = np.array([q, *ends])
         self.low = np.minimum(r.q_min + zone, anchors.min(axis=0))
         self.high = np.maximum(r.q_max - zone, anchors.max(axis=0))
-        self.body: Body = body_of(r)
+        self.body: Body = body_of(r, None if share else skin_of(r.body))  # the last try looks at the links themselves
         self.obstacles, self.asked = site.obstacles, 0
         self.room = Room(
             max(share * r.avoid.rho0, WAY_ROOM * r.avoid.rho_min),

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm.kinematics import Chain, chain_of, placements
+from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
 from rtctl.arm.self_collision import Hulls, not_apart
 from rtctl.kernel import kernel
@@ -12,6 +13,16 @@ from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into
 
 RELAX = 0.3  # [m/rad] by which what must be kept free grows from what an anchor has
+
+
+class Skin(NamedTuple):
+    """Balls about the links' surface, those within each point together; empty: the points alone count."""
+
+    local: F64  # (s, 3) [m] in the link of the point
+    radius: F64  # (s,) [m]
+    start: I64  # (m + 1,) of each point's; (0,) for none
+    keep: float  # [m] that it keeps where the points do not keep their room
+    overhang: float  # [m] by which points stand out of links at most
 
 
 class Body(NamedTuple):
@@ -23,6 +34,7 @@ class Body(NamedTuple):
     radius: F64  # (m,) [m]
     pairs: I64  # (L, 2) of hulls
     hulls: Hulls
+    skin: Skin
 
 
 class Room(NamedTuple):
@@ -34,10 +46,45 @@ class Room(NamedTuple):
     near: F64  # (a, 2) [m] rho and own there
 
 
-def body_of(robot: Robot) -> Body:
-    """Return what of a robot can touch something."""
+def body_of(robot: Robot, skin: Points | None = None) -> Body:
+    """Return what of a robot can touch something; skin: balls that cover the links' surface, or the points alone."""
     points, own = robot.points, robot.own
-    return Body(chain_of(robot.body), points.link, points.local, points.radius, own.pairs, own.arrays)
+    return Body(
+        chain_of(robot.body),
+        points.link,
+        points.local,
+        points.radius,
+        own.pairs,
+        own.arrays,
+        Skin(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), 0.0, 0.0) if skin is None else _within(robot, skin),
+    )
+
+
+def _within(robot: Robot, skin: Points) -> Skin:
+    points, found = robot.points, []
+    for link, centre, radius in zip(points.link, points.local, points.radius, strict=True):
+        away = np.linalg.norm(skin.local - centre, axis=1)
+        found.append(np.flatnonzero((skin.link == link) & (away <= radius + skin.radius)))
+    order, start = np.concatenate(found), np.cumsum([0, *map(len, found)])
+    keep, overhang = robot.avoid.rho_min, robot.coverage.overhang
+    return Skin(skin.local[order], skin.radius[order], start.astype(np.int64), keep, overhang)
+
+
+@kernel
+def _skin_keeps(body: Body, j: int, R: F64, t: F64, obstacles: Obstacles, rho: float) -> bool:
+    """Return whether the links' surface within point j keeps rho [m] from every obstacle."""
+    first, count, l = body.skin.start[j], body.skin.start[j + 1] - body.skin.start[j], body.link[j]
+    P, out = np.empty((3, count)), np.empty((obstacles.active.shape[0], 4, count))
+    for s in range(count):
+        x = body.skin.local[first + s]
+        for i in range(3):
+            P[i, s] = t[l, i] + R[l, i, 0] * x[0] + R[l, i, 1] * x[1] + R[l, i, 2] * x[2]
+    distances_into(P, body.skin.radius[first : first + count], obstacles, rho, out)
+    for o in range(out.shape[0]):
+        for s in range(count):
+            if out[o, 0, s] < rho:
+                return False
+    return True
 
 
 @kernel
@@ -70,10 +117,17 @@ def first_blocked(body: Body, Q: F64, obstacles: Obstacles, room: Room, share: f
                     P[i, j] = t[l, i] + R[l, i, 0] * body.local[j, 0] + R[l, i, 1] * body.local[j, 1]
                     P[i, j] += R[l, i, 2] * body.local[j, 2]
             distances_into(P, body.radius, obstacles, room.rho, rho)
-            for o in range(rho.shape[0]):
-                for j in range(m):
-                    if rho[o, 0, j] < share * free:
-                        return k
+            keep = share * min(free, body.skin.keep)
+            for j in range(m):
+                least = np.inf
+                for o in range(rho.shape[0]):
+                    least = min(least, rho[o, 0, j])
+                if least >= share * free:
+                    continue
+                if body.skin.start.shape[0] == 0 or least < keep - body.skin.overhang:
+                    return k
+                if not _skin_keeps(body, j, R, t, obstacles, keep):
+                    return k
             if body.pairs.shape[0] > 0 and not_apart(body.pairs, body.hulls, share * own, R, t).shape[0] > 0:
                 return k
         first = False
