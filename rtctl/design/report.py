@@ -205,7 +205,7 @@ def _resolution(r: Robot) -> list[Row]:
     inertia = r.stop.damping / r.stop.decay  # A_ii at home
     step = r.tau_lsb / np.sqrt(12.0) / inertia / r.joint_filter.sigma_qdd
     i = int(step.argmax())
-    note = f"of the estimator's noise is a step of {r.tau_lsb[i]:.2g} Nm, worst: {r.joints[i]}"
+    note = f"{r.tau_lsb[i]:.2g} Nm over the estimator's noise, worst: {r.joints[i]}"
     return [_row("torque resolution", step[i], "x", note, bool(step[i] <= 1.0))]
 
 
