@@ -144,14 +144,14 @@ class Bank:
         bank_kernels.sense(f, i, self._motion)
         bank_kernels.close_period(f, i)
 
-    def answer(self, came: Batch, replies: Batch, first: int, clocked: bool) -> tuple[int, int]:
-        """Take the frames of a batch from `first` on, and add the replies to another.
+    def answer(self, came: Batch, replies: Batch, first: int, end: int, clocked: bool) -> tuple[int, int]:
+        """Take the frames of a batch from `first` to `end`, that one not included, and add the replies to another.
 
         Returns the next frame and why it stopped there, see `bank_kernels.answer`; `clocked`: for the clock, too.
         """
         before = replies.count
         at, replies.count, why = bank_kernels.answer(
-            self.f, self.i, self._forms[clocked], came.raw, came.lengths[: came.count], first, replies.raw, before
+            self.f, self.i, self._forms[clocked], came.raw, came.lengths[:end], first, replies.raw, before
         )
         if replies.room != self.size:
             replies.lengths[before : replies.count] = self.size

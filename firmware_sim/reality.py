@@ -36,6 +36,7 @@ class Reality(NamedTuple):
     reply_loss: float  # share of replies that never arrive
     reply_late: float  # share of replies that arrive a period late
     talkers: tuple[int, ...]  # CAN ids on which somebody else sends a frame every period
+    gripper_thing: float  # share of its way at which a gripper meets something, above 1 nothing
     engine: str  # that moves the arm, one of ENGINES
     model: str  # an MJCF file that stands for the robot file's URDF, '' for none
 
@@ -43,7 +44,7 @@ class Reality(NamedTuple):
 KEYS = (
     "payload_kg", "payload_com_m", "payload_link", "mass_error", "inertia_error", "urdf_dynamics", "coulomb_Nm",
     "static_Nm", "viscous_Nms_rad", "torque_gain", "brake", "encoder_zero_rad", "encoder_direction", "reply_loss",
-    "reply_late", "talker_ids", "engine", "model",
+    "reply_late", "talker_ids", "gripper_thing", "engine", "model",
 )  # fmt: skip
 
 
@@ -76,6 +77,7 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
         reply_loss=_one(table, "reply_loss", 0.0, _within(0.0, 1.0)),
         reply_late=_one(table, "reply_late", 0.0, _within(0.0, 1.0)),
         talkers=_ids(table, "talker_ids"),
+        gripper_thing=_one(table, "gripper_thing", 2.0, _within(0.0, 2.0)),
         engine=engine,
         model=model,
     )

@@ -12,7 +12,6 @@ may have, where pybullet takes them as they are: one more way in which the two d
 
 import site
 import sys
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from firmware_sim.urdf import PAYLOAD, PAYLOAD_RADIUS, rewrite, urdf_dynamics
 
 F64 = NDArray[np.float64]
 STIFF = (0.9999, 0.9999, 1e-3, 0.5, 2.0)  # impedance of dry friction: the closer to 1 the less a held joint creeps
+mj.set_mju_user_warning(lambda text: None)  # else MuJoCo writes a file where the program was called
 AWAY = (0.0, 0.0, 1e3)  # [m] where obstacles wait that are not there
 LEAST_MASS, LEAST_INERTIA = 1e-6, 1e-9  # [kg], [kg m^2] of bodies that have none: rotors may be all that moves
 
@@ -67,6 +67,7 @@ class SecondPlant(Plant):
         model.opt.gravity = (0.0, 0.0, -GRAVITY)
         model.opt.integrator = mj.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.tolerance, model.opt.iterations = 1e-10, 100
+        model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET  # an arm that breaks does not jump to its zero
         model.dof_solimp[self.dof] = STIFF
         model.dof_solref[self.dof] = (2.0 * self.step_ns / NS, 1.0)
         viscous, _ = urdf_dynamics(settings, reality)
@@ -182,14 +183,15 @@ def _another(settings: Settings, reality: Reality) -> mj.MjSpec:
                 body.fullinertia = body.fullinertia * factor
     if reality.payload_kg > 0.0:
         _carry(arm, settings, reality, path)
-    spec = mj.MjSpec()
-    spec.compiler.balanceinertia = True
-    spec.compiler.boundmass, spec.compiler.boundinertia = LEAST_MASS, LEAST_INERTIA
-    foot = spec.worldbody.add_frame(pos=settings.base_position, quat=settings.base_wxyz)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of options that differ: `_adopt` states them
-        spec.attach(arm, frame=foot, prefix="")
-    return spec
+    arm.compiler.balanceinertia = True
+    arm.compiler.boundmass, arm.compiler.boundinertia = LEAST_MASS, LEAST_INERTIA
+    base, turned = np.array(settings.base_position), np.array(settings.base_wxyz)
+    for body in arm.worldbody.bodies:
+        at, quat = np.zeros(3), np.zeros(4)
+        mj.mju_rotVecQuat(at, body.pos, turned)
+        mj.mju_mulQuat(quat, turned, body.quat)
+        body.pos, body.quat = base + at, quat
+    return arm
 
 
 def _carry(arm: mj.MjSpec, settings: Settings, reality: Reality, path: Path) -> None:
@@ -217,9 +219,7 @@ def model_file(settings: Settings, name: str) -> Path:
 
 def _compiled(spec: mj.MjSpec, settings: Settings, reality: Reality) -> mj.MjModel:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return spec.compile()
+        return spec.compile()
     except ValueError as error:
         raise SettingsError(f"{reality.model or settings.urdf}: MuJoCo: {error}") from error
 

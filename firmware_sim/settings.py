@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from firmware_sim import codec
 from firmware_sim.drive import Rating
+from firmware_sim.gripper import GripperSetting, gripper_settings
 
 # published full scales; [drives.NAME] in the file adds to them or overrides
 SCALES = {
@@ -67,6 +68,7 @@ class Settings(NamedTuple):
     base_wxyz: tuple[float, float, float, float]
     joints: tuple[JointSetting, ...]
     ratings: tuple[Rating, ...]
+    grippers: tuple[GripperSetting, ...]
     home: tuple[float, ...]
     period_ns: int
     interface: str
@@ -174,6 +176,7 @@ def _settings(file: dict[str, Any], path: Path, control_hz: float | None) -> Set
             for j in robot["joints"]
         ),
         ratings=tuple(_rating(j, scales, common) for j in robot["joints"]),
+        grippers=gripper_settings(file.get("gripper", []), lambda g: _gripper(g, scales, common)),
         home=tuple(map(float, robot["home_rad"])),
         period_ns=period_ns,
         interface=link["interface"],
@@ -201,5 +204,21 @@ def _rating(joint: dict[str, Any], scales: dict[str, codec.Scale], common: dict[
         torque_rate=float(joint["tau_rate_Nm_s"]),
         speed=float(joint["qd_max_rad_s"]),
         reply=int(joint.get("reply_id", -1)),
+        **common,
+    )
+
+
+def _gripper(table: dict[str, Any], scales: dict[str, codec.Scale], common: dict[str, Any]) -> Rating:
+    if table["drive"] not in scales:
+        raise ValueError(f"drive {table['drive']} is not one of {', '.join(sorted(scales))}")
+    scale = scales[table["drive"]]
+    return Rating(
+        motor=int(table["can_id"]),
+        scale=scale,
+        torque=scale.t,
+        torque_rate=1e3 * scale.t,
+        speed=scale.v,
+        reply=int(table.get("reply_id", -1)),
+        release_ns=0,
         **common,
     )

@@ -16,6 +16,7 @@ from firmware_sim.bank import Bank
 from firmware_sim.batch import CAPACITY, Batch
 from firmware_sim.cells import LARGEST, TORQUE
 from firmware_sim.drive import NS
+from firmware_sim.gripper import Finger
 from firmware_sim.inject import Injector, faults_of, parse
 from firmware_sim.plant import Plant
 from firmware_sim.reality import Reality, braked, reality_of
@@ -64,7 +65,8 @@ class Simulator:
         self.injector = injector
         real = self.reality
         traffic = Traffic(real.reply_loss, real.reply_late, real.talkers, settings.fd, injector.seed)
-        self.wire = Wire(self.bank, injector, settings.fd, traffic)
+        self.fingers = [Finger(setting, real.gripper_thing) for setting in settings.grippers]
+        self.wire = Wire(self.bank, injector, settings.fd, traffic, [finger.drive for finger in self.fingers])
         self.plant = plant_of(settings, start_q, obstacles, self.reality)
         self.started = not wait
         self.exact = True  # whether every truth tells exact clearances; else their least over the run alone are exact
@@ -119,6 +121,8 @@ class Simulator:
             plant.push(self.injector.pushes(plant.scene_ns))
         enabled = bank.actuate(plant.step_ns)
         plant.step(bank.torque.tolist(), bank.drag.tolist())
+        for finger in self.fingers:
+            finger.step(plant.step_ns)
         self.started = self.started or enabled
         if self.started:
             plant.scene_ns += plant.step_ns

@@ -4,11 +4,16 @@ A batch goes through compiled code as far as it is of the common form and nothin
 by frame through `Drive`'s own Python, in the same order.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from firmware_sim import codec
 from firmware_sim.bank import Bank
 from firmware_sim.bank_kernels import AGAIN, ALL_READ, EVERYBODY, UNCOMMON
 from firmware_sim.batch import Batch
 from firmware_sim.cells import COMMANDED
+from firmware_sim.drive import Drive
 from firmware_sim.inject import Injector
 from firmware_sim.traffic import SILENT, Traffic
 from rtctl.protocol import frame
@@ -17,7 +22,11 @@ from rtctl.protocol import frame
 class Wire:
     """Routes frames by their identifier; owns nothing."""
 
-    def __init__(self, bank: Bank, injector: Injector, fd: bool, traffic: Traffic = SILENT) -> None:
+    def __init__(
+        self, bank: Bank, injector: Injector, fd: bool, traffic: Traffic = SILENT, others: Sequence[Drive] = ()
+    ) -> None:
+        """`others`: drives of the bus that are no joint's."""
+        self.others = {d.rating.motor: d for d in others}
         self.bank, self.injector, self.fd, self.traffic = bank, injector, fd, traffic
         self.drives = bank.drives
         self.by_id = {d.rating.motor: k for k, d in enumerate(self.drives)}
@@ -30,9 +39,10 @@ class Wire:
         """
         at, quiet = first, self.traffic.quiet and self.injector.quiet(now)
         while at < came.count:
-            if quiet:
-                at, why = self.bank.answer(came, replies, at, clocked)
-                if why != UNCOMMON:
+            end = self._own(came, at)
+            if quiet and at < end:
+                at, why = self.bank.answer(came, replies, at, end, clocked)
+                if why != UNCOMMON and (why != ALL_READ or at == came.count):
                     return at, why
             raw = came.frame(at)
             if clocked and self._repeats(raw):
@@ -42,6 +52,14 @@ class Wire:
             if clocked and self.bank.i[:, COMMANDED].all():
                 return at, EVERYBODY
         return at, ALL_READ
+
+    def _own(self, came: Batch, first: int) -> int:
+        """Return where the first frame from `first` on is that one of the others has to take; else the end."""
+        if not self.others:
+            return came.count
+        ids = came.raw[first : came.count, 0].astype(np.int64) | came.raw[first : came.count, 1].astype(np.int64) << 8
+        at = np.flatnonzero(np.isin(ids, list(self.others)))
+        return first + int(at[0]) if len(at) else came.count
 
     def _repeats(self, raw: bytes) -> bool:
         """Tell whether a frame commands a joint that has its command of this period already."""
@@ -63,6 +81,8 @@ class Wire:
         if f.can_id == codec.REGISTER_ID:
             return self._register(now, f.data)
         k = self.by_id.get(f.can_id, -1)
+        if f.can_id in self.others:
+            return self._other(self.others[f.can_id], self.others[f.can_id].receive(f.data))
         if k < 0:
             return []
         self.bank.i[k, COMMANDED] = 1
@@ -70,8 +90,15 @@ class Wire:
         return self._sent(now, k, self.drives[k].receive(data) if data is not None else None)
 
     def _register(self, now: int, data: bytes) -> list[bytes]:
-        k = self.by_id.get(codec.decode_register(data).motor, -1) if len(data) >= 8 else -1
+        motor = codec.decode_register(data).motor if len(data) >= 8 else -1
+        if motor in self.others:
+            return self._other(self.others[motor], self.others[motor].register(data))
+        k = self.by_id.get(motor, -1)
         return self._sent(now, k, self.drives[k].register(data)) if k >= 0 else []
+
+    def _other(self, drive: Drive, reply: bytes | None) -> list[bytes]:
+        can_id = int(drive.registers[codec.MST_ID])
+        return [] if reply is None else [frame.pack(can_id, reply, fd=self.fd, brs=self.fd)]
 
     def _sent(self, now: int, k: int, reply: bytes | None) -> list[bytes]:
         """Return a drive's reply as frames on the bus, after whatever injector and traffic do to it."""

@@ -188,6 +188,14 @@ class Payload(NamedTuple):
     z: float = 0.0
 
 
+class Grip(NamedTuple):
+    """What a gripper shall do."""
+
+    closed: float  # 0 open, 1 closed
+    force: float = 0.0  # [N] at most, 0: the gripper's own bound
+    name: str = ""  # of the gripper, '' every one
+
+
 class Request(NamedTuple):
     """Everything that reaches the tick from operators and sensors in one slot."""
 
@@ -196,6 +204,10 @@ class Request(NamedTuple):
     obstacles: tuple[ObstacleEdit, ...] = ()
     payload: Payload | None = None
     advice: Advice | None = None
+    grip: Grip | None = None
+
+
+NO_GRIPPERS = np.zeros((5, 0))
 
 
 class Feedback(NamedTuple):
@@ -212,6 +224,7 @@ class Feedback(NamedTuple):
     link: int  # Link flags of the cycle
     lateness: float  # [s] of the previous wake-up; logged, never used by the law
     compute: float  # [s] of the previous tick; logged, never used by the law
+    grippers: F64 = NO_GRIPPERS  # (5, g) q [rad], qd [rad/s], tau [Nm], age [s], drive status code of each
 
 
 class Hold(NamedTuple):
@@ -230,6 +243,7 @@ class Command(NamedTuple):
     drive: Drive
     tau: F64  # (n,) [Nm]
     hold: Hold | None = None  # of Drive.HOLD
+    grippers: F64 = NO_GRIPPERS  # (5, g) p [rad], v [rad/s], kp [Nm/rad], kd [Nms/rad], t [Nm] of their drives' loops
 
 
 class Frames(Sequence[bytes]):

@@ -91,6 +91,24 @@ def test_old_versions_are_let_go(lab: Path) -> None:
     assert not kept & {"old0", "old1", "old2"}
 
 
+def test_a_folder_that_another_process_lets_go_of_meanwhile_is_made_again(lab: Path) -> None:
+    """The other's part is played at the worst moment: when numba has seen to the folder and is about to write."""
+    pruned = (
+        "import shutil\nfrom numba.core.caching import IndexDataCacheFile as File\nsave, seen = File.save, set()\n"
+        "def pruned(self, *what):\n"
+        "    if self._index_path not in seen:\n"
+        "        seen.add(self._index_path)\n"
+        "        shutil.rmtree(self._cache_path)\n"
+        "    save(self, *what)\n"
+        "File.save = pruned\n"
+    )
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    env |= {"PYTHONPATH": f"{lab.parent}:{ROOT}", "XDG_CACHE_HOME": str(lab.parent / "cache")}
+    done = subprocess.run([sys.executable, "-c", pruned + RUN], env=env, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)[0] == [3.0, 2.0, -1.0, 5.0]
+    assert run(lab) == ([3.0, 2.0, -1.0, 5.0], [])
+
+
 def test_a_folder_that_others_may_write_is_not_taken(lab: Path) -> None:
     (lab.parent / "cache" / "rtctl").mkdir(parents=True)
     (lab.parent / "cache" / "rtctl").chmod(0o777)

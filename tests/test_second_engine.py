@@ -55,7 +55,7 @@ def test_a_motor_s_inertia_adds_to_the_link_s(tmp_path: Path, armature: float):
 
 
 def test_a_brake_holds_what_is_less_than_it_and_slips_under_more(tmp_path: Path):
-    plant = swinging(tmp_path, 0.5)
+    plant = swinging(tmp_path, 0.5, brake="ideal")
     weight = MASS * 9.81 * LENGTH * math.sin(0.5)
     for _ in range(1000):
         plant.step([0.0], [weight * 1.05])

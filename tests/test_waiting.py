@@ -13,7 +13,7 @@ import pytest
 from rtctl.app.queue import QUEUED, GoalQueue
 from rtctl.cli import main
 from rtctl.cli.offline import _missed
-from rtctl.errors import EXIT_FAILED, EXIT_OK, LinkError, RequestError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, LinkError, RequestError
 from rtctl.hal.client import Session, answers
 from rtctl.hal.console import Console
 from rtctl.hal.lobby import Lobby
@@ -225,3 +225,29 @@ def test_a_request_whose_caller_has_given_up_is_refused(now: float, taken: bool)
         return
     with pytest.raises(RequestError, match=r"too late: the caller waited until 0\.5 s ago"):
         request_of(message, BOUNDS, lambda: (1.0, 0.0, 0.0, 0.0), now)
+
+
+# ---- a gripper
+
+
+def test_grip_waits_until_the_gripper_is_there_or_holds_something(place: str, capsys: Said):
+    toy: Toy
+
+    def closing(request: Request) -> str:
+        if request.grip is not None:
+            if request.grip.force > 60.0:
+                return "grip: gripper: got 61 N, wanted at most 60"
+            toy.told["grippers"] = [{"name": "gripper", "state": "moving", "closed": 0.2, "force_N": 0.0}]
+            threading.Timer(
+                0.3, lambda: toy.told["grippers"][0].update(state="gripping", closed=0.6, force_N=19.0)
+            ).start()
+        return ""
+
+    with Toy(place, closing) as toy:
+        toy.told["state"] = "RUN"
+        assert main(["grip", "1", "--force", "20", "--socket", place, *PATIENT]) == EXIT_OK
+        assert capsys.readouterr().out == "grip: gripper gripping at 0.60, 19.0 N\n"
+        assert main(["grip", "1", "--force", "61", "--socket", place, *PATIENT]) == EXIT_FAILED
+        assert capsys.readouterr().err == "rtctl: refused: grip: gripper: got 61 N, wanted at most 60\n"
+        assert main(["grip", "2", "--socket", place, *PATIENT]) == EXIT_USAGE
+        assert "grip.closed: got 2.0, wanted" in capsys.readouterr().err

@@ -30,6 +30,7 @@ from rtctl.app.vehicle import (
     clearances,
 )
 from rtctl.arm import faults, task
+from rtctl.arm.gripper import SEEN, TARGET, TAU, TORQUE, Gripper, Q, state_of
 from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial, tick, warm
@@ -100,6 +101,8 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("payload", f"{mass:g} kg at {x:g} {y:g} {z:g} m of the tip" if mass > 0.0 else "none"))
     if before.floating and not after.floating:
         found.append(("hold", "no hand guides the arm any more"))
+    if robot.grippers:
+        found += gripper_events(robot, before, after)
     if (after.status, after.blockers) != (before.status, before.blockers) and after.status != Status.NO_GOAL:
         found.append((after.status.name.lower(), "; ".join(after.blocked_by)))
     return found
@@ -145,9 +148,34 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
         "error_rad": error_rot,
         "clearance_m": clearances(m),
         "payload": dict(zip(("mass_kg", "com_m"), (float(m.payload[0]), m.payload[1:]), strict=True)),
+        "grippers": [grip_status(g, m.grippers[:, k]) for k, g in enumerate(robot.grippers)],
         "untold_Nm": m.lasting if m.noticed else np.zeros(robot.n),
         "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
     }
+
+
+def grip_status(gripper: Gripper, memory: F64) -> Json:
+    """Return what `rtctl status` shows of a gripper; memory (9,)."""
+    target, seen = float(memory[TARGET]), memory[SEEN:]
+    return {
+        "name": gripper.name,
+        "state": state_of(gripper, memory),
+        "closed": gripper.share(float(seen[Q])),
+        "wanted": None if np.isnan(target) else gripper.share(target),
+        "force_N": abs(float(seen[TAU])) / gripper.lever,
+        "force_max_N": float(memory[TORQUE]) / gripper.lever,
+    }
+
+
+def gripper_events(robot: Robot, before: Memory, after: Memory) -> list[Event]:
+    """Return which grippers are newly in another state, in words."""
+    found = []
+    for k, g in enumerate(robot.grippers):
+        now = state_of(g, after.grippers[:, k])
+        if now != state_of(g, before.grippers[:, k]):
+            at = g.share(float(after.grippers[SEEN + Q, k]))
+            found.append(("gripper", f"{g.name}: {now} at {min(max(at, 0.0), 1.0):.2f} of closed"))
+    return found
 
 
 def _warm(robot: Robot) -> None:

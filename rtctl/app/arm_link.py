@@ -12,7 +12,11 @@ from rtctl.hal.can.handshake import handshake
 from rtctl.hal.can.link import CanLink, JointSpec, LinkSpec, identifiers
 from rtctl.hal.can.transport import open_transport
 from rtctl.protocol.mounting import Mounting
+from rtctl.spec.robot import GripperTable
+from rtctl.spec.rules import scale_of
 from rtctl.types import F64, Feedback, Transport
+
+NOBODY: F64 = np.zeros(0)
 
 
 class ArmLink(CanLink):
@@ -31,19 +35,19 @@ class ArmLink(CanLink):
         else:
             found = handshake(self, listen=self.listen, recover=True)
         self.said += found.told
-        return first_feedback(found.q)
+        return first_feedback(found.q[: self.n], found.q[self.n :])
 
     def settle(self) -> None:
         """Do nothing: drives speak when they are spoken to."""
 
 
-def first_feedback(q: F64) -> Feedback:
-    """Return the feedback of a handshake: positions (n,) [rad], everything else at rest."""
+def first_feedback(q: F64, grippers: F64 = NOBODY) -> Feedback:
+    """Return the feedback of a handshake: positions (n,) of joints, (g,) of grippers [rad], all else at rest."""
     n = len(q)
-    zero = np.zeros(n)
-    return Feedback(
-        -1, 0, q.astype(np.float64), zero, zero, zero, np.ones(n, np.int64), np.zeros(n, np.int64), 0, 0.0, 0.0
-    )
+    zero, seen = np.zeros(n), np.zeros((5, len(grippers)))
+    seen[0] = grippers
+    one, off = np.ones(n, np.int64), np.zeros(n, np.int64)
+    return Feedback(-1, 0, q.astype(np.float64), zero, zero, zero, one, off, 0, 0.0, 0.0, seen)
 
 
 def link_spec(config: Config) -> LinkSpec:
@@ -61,14 +65,23 @@ def link_spec(config: Config) -> LinkSpec:
         )
         for j, scale in zip(config.robot.joints, scales(config), strict=True)
     )
+    grippers = tuple(_gripper(config, table) for table in config.gripper)
     return LinkSpec(
         place=config.link.channel,
-        joints=joints,
+        joints=(*joints, *grippers),
         protocol=config.link.protocol,
         fd=config.link.fd,
         period=1.0 / config.loop.servo_hz,
         watchdog=1e-3 * config.safety.watchdog_ms,
+        grippers=len(grippers),
     )
+
+
+def _gripper(config: Config, table: GripperTable) -> JointSpec:
+    """Return a gripper as the link knows it; a finger that stands anywhere is no reason to refuse it."""
+    scale = scale_of(config, table.drive)
+    assert scale is not None  # `load` let the config through
+    return JointSpec(table.name, table.can_id, scale, -scale.p_max, scale.p_max, table.reply_id)
 
 
 def open_link(config: Config, path: Path) -> ArmLink:

@@ -12,6 +12,7 @@ from rtctl import design as cfg
 from rtctl.app.arm_link import ArmLink, first_feedback, link_spec
 from rtctl.app.vehicle import Rebuilt
 from rtctl.arm.memory import Memory
+from rtctl.arm.record import record_dtype
 from rtctl.arm.robot import Robot
 from rtctl.design import Config
 from rtctl.design.assets import files_named
@@ -41,7 +42,7 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
     files |= meshes_to_files(robot.meshes)
     if meshes := archive(text, urdf.parent, package_folders(urdf), files_named(config), path.resolve().parent):
         files[MESHES] = meshes
-    return make_header(
+    header = make_header(
         robot.name,
         robot.joints,
         robot.slots,
@@ -51,6 +52,7 @@ def header_of(config: Config, path: Path, robot: Robot, q: F64, counters: tuple[
         extra={"q_handshake": np.asarray(q, np.float64).tobytes().hex(), "counters": json.dumps(counters), **extra},
         files=files,
     )
+    return header._replace(dtype=record_dtype(robot.n, robot.slots, len(robot.grippers)))
 
 
 def drive_dbc(config: Config) -> str:

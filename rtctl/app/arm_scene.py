@@ -24,6 +24,7 @@ from rtctl.types import (
     Drive,
     Feedback,
     Goal,
+    Grip,
     ObstacleEdit,
     Request,
     Shape,
@@ -104,6 +105,7 @@ class ArmFeed:
         """`guide` advises; without one the law is alone, unless the scenario asks for a plan of each goal."""
         self.robot, self.simulator, self.tally = robot, simulator, tally
         self.pending = list(scenario.goal)
+        self.grips = sorted(scenario.grip, key=lambda g: g.at_s)
         self.waiting: tuple[Goal, float, F64] | None = None  # given to the tick, its refusal not yet seen
         self.last: dict[str, Shape | None] = {}
         self.frames = 0
@@ -127,8 +129,15 @@ class ArmFeed:
             goal = goal_of(self.pending.pop(0), quat_of(m.tip.R), self.robot.tolerance, self.robot.tolerance_rot)
             goal = goal._replace(task=task.within(goal.task, self.robot.axes)[0])
             self.waiting = (goal, truth.time, truth.tip.copy())
-            return Request(verb, goal, self._seen(truth))
-        return Request(verb, None, self._seen(truth), advice=self._advice(m, truth))
+            return Request(verb, goal, self._seen(truth), grip=self._grip(m, truth))
+        return Request(verb, None, self._seen(truth), advice=self._advice(m, truth), grip=self._grip(m, truth))
+
+    def _grip(self, m: Memory, truth: Truth) -> Grip | None:
+        """Return what grippers are asked now; what is due before the arm runs waits."""
+        if not self.grips or m.state != State.RUN or truth.time < self.grips[0].at_s:
+            return None
+        asked = self.grips.pop(0)
+        return Grip(asked.closed, asked.force_N)
 
     def _advice(self, m: Memory, truth: Truth) -> Advice | None:
         if self.guide is None or not self.guide.due(m.tick):

@@ -58,10 +58,12 @@ class Live:
         if self._console is None:
             return scripted
         by_people = self._console.poll(slot)
-        return Request(
-            by_people.verb or scripted.verb,
-            by_people.goal if by_people.goal is not None else scripted.goal,
-            (*scripted.obstacles, *by_people.obstacles),
+        return scripted._replace(
+            verb=by_people.verb or scripted.verb,
+            goal=by_people.goal if by_people.goal is not None else scripted.goal,
+            obstacles=(*scripted.obstacles, *by_people.obstacles),
+            payload=by_people.payload,
+            grip=by_people.grip or scripted.grip,
         )
 
     def answer(self, refusal: str) -> None:

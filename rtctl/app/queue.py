@@ -30,7 +30,7 @@ class GoalQueue:
             self._goal, self.refusal = None, f"goal: dropped, the robot went from ARMED to {state.name}"
         elif request.verb == Verb.NONE and not request.obstacles:
             goal, self._goal, self._given = self._goal, None, True
-            return Request(goal=goal), ""
+            return request._replace(goal=goal), ""
         return request, ""
 
     def judged(self, refusal: str) -> None:

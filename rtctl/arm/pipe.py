@@ -11,11 +11,12 @@ from rtctl.arm.escape import Escape
 from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import parameters_of, shapes_of, table_of
+from rtctl.arm.gripper import DRIVEN, gripped, refused, unasked
 from rtctl.arm.law import REVIEW
 from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
 from rtctl.arm.model import Model
 from rtctl.arm.payload import with_payload
-from rtctl.arm.record import record_dtype
+from rtctl.arm.record import record_dtype, with_grippers
 from rtctl.arm.robot import Robot
 from rtctl.arm.servo_level import (
     ATTENTION,
@@ -82,7 +83,7 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
             arm, hot, parameters, table, shapes, bodies, ends, f, asking(MEASURED, bits, verb)
         )
     if flags & ATTENTION:
-        m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends)
+        m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends, m.grippers)
         m, chosen = _decided(robot, m, feedback, request)
         hot, table, blocked_by, refusal, ends = m.hot, m.table, m.blocked_by, m.refusal, m.ends
         model, parameters = m.model, m.parameters
@@ -92,12 +93,15 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     if not robot.carry:
         model = model._replace(q=record_of(hot)["q"][0, : robot.n])  # the points have not moved either
     blocked_by = () if flags & WORDS else blocked_by
-    m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends)
+    m = Memory(hot, robot.n, refusal, blocked_by, model, parameters, placed, table, shapes, ends, memory.grippers)
     record = np.frombuffer(raw, record_dtype(robot.n, robot.slots))
     if flags & DIAGNOSE:
         m = _diagnosed(robot, m, memory, record)
+    command = _command(DRIVES[record["command"].item()], hot, robot.n)
+    if robot.grippers or request.grip is not None:
+        m, command, record = _gripped(robot, m, (feedback, request), command, record)
     record.flags.writeable = False
-    return m, _command(DRIVES[record["command"].item()], hot, robot.n), record
+    return m, command, record
 
 
 def _command(drive: Drive, hot: F64, n: int) -> Command:
@@ -108,6 +112,18 @@ def _command(drive: Drive, hot: F64, n: int) -> Command:
     off = (h["lost"][0] >> np.arange(n) & 1).astype(np.bool_) & (h["own_t"][0, :n] == 0.0)
     p, v, kp, kd, t = (h[name][0, :n] for name in ("own_p", "own_v", "own_kp", "own_kd", "own_t"))
     return Command(drive, t, Hold(p, v, kp, kd, off))
+
+
+def _gripped(
+    robot: Robot, m: Memory, came: tuple[Feedback, Request], command: Command, record: Record
+) -> tuple[Memory, Command, Record]:
+    """Return memory, command and record with the grippers in them, or with the reason why they are not moved."""
+    feedback, request = came
+    why = "" if request.grip is None else refused(robot.grippers, request.grip, command.drive in DRIVEN)
+    asked, elapsed = None if why else request.grip, robot.dt * (1 + min(feedback.missed, MISSED_MAX))
+    memory, command = gripped(robot.grippers, m.grippers, feedback.grippers, asked, command, elapsed)
+    m = m._replace(grippers=memory, refusal=why or m.refusal)
+    return m, command, with_grippers(record, feedback.grippers, memory) if robot.grippers else record
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
@@ -122,8 +138,8 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         shapes_of(table.obstacles, table.moving, table.creep, table.stale),
         table_of(table.obstacles, table.age, far, far),
     )
-    ends = np.zeros((len(robot.points.radius), 3))
-    return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes, ends)._replace(
+    ends, grippers = np.zeros((len(robot.points.radius), 3)), unasked(len(robot.grippers))
+    return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes, ends, grippers)._replace(
         tick=-1,
         state=State.IDLE,
         since=-1,

@@ -10,13 +10,17 @@ import numpy as np
 
 from rtctl.kernel import kernel
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, I32, U32, Feedback, RecordRow
+from rtctl.types import F64, I32, U32, Feedback, Record, RecordRow
+
+SEEN = ("q", "qd", "tau", "age", "status")  # of a gripper, the rows of Feedback.grippers
+GRIPPER = (*SEEN, "target", "torque", "p")  # and of what it remembers: asked for [rad], at most [Nm], reference [rad]
 
 
 @cache
-def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
-    """Return the packed little-endian dtype of a tick of n joints and `slots` obstacle slots."""
-    f, joint, obstacle = "<f8", (n,), (slots,)
+def record_dtype(n: int, slots: int, grippers: int = 0) -> np.dtype[np.void]:
+    """Return the packed little-endian dtype of a tick of n joints, `slots` obstacle slots and so many grippers."""
+    f, joint, obstacle, gripper = "<f8", (n,), (slots,), (grippers,)
+    held = [(f"gripper_{name}", f, gripper) for name in GRIPPER] if grippers else []
     return np.dtype(
         [
             ("tick", "<u8"),
@@ -70,12 +74,28 @@ def record_dtype(n: int, slots: int) -> np.dtype[np.void]:
             ("severity", "<u4"),  # types.Severity
             ("faults", "<u8"),  # bit i = arm.faults.FAULTS[i]
             ("model_evaluated", "<u4"),
+            *held,
         ]
     )
 
 
 _WORD = 0xFFFFFFFF
 SCALARS = record_dtype(0, 0).itemsize  # bytes of what does not depend on joints and slots
+
+
+def with_grippers(record: Record, seen: F64, memory: F64) -> Record:
+    """Return a record with g grippers behind it; seen (5, g) as in Feedback, memory (9, g) as in Memory."""
+    tail = np.concatenate((seen, memory[: len(GRIPPER) - len(SEEN)]))
+    n, slots = record["q"].shape[1], record["rho"].shape[1]
+    both = bytearray(record.tobytes() + tail.astype("<f8").tobytes())
+    return np.frombuffer(both, record_dtype(n, slots, seen.shape[1]))
+
+
+def grippers_seen(records: Record) -> F64:
+    """Return Feedback.grippers (T, 5, g) of T records."""
+    if "gripper_q" not in (records.dtype.names or ()):
+        return np.zeros((len(records), len(SEEN), 0))
+    return np.stack([records[f"gripper_{name}"] for name in SEEN], axis=1)
 
 
 class Outcome(NamedTuple):

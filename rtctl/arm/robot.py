@@ -7,6 +7,7 @@ import numpy as np
 from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
 from rtctl.arm.field import Field, FieldParams, LimitParams
+from rtctl.arm.gripper import Gripper
 from rtctl.arm.model import RigidBody
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
@@ -57,6 +58,7 @@ class Robot(NamedTuple):
     tau_rated: F64  # (n,) [Nm] rating of the joint
     tau_rate: F64  # (n,) [Nm/s]
     tau_lsb: F64  # (n,) [Nm] rounding of the torque a drive echoes
+    grippers: tuple[Gripper, ...]  # on its bus
     payload_max: float  # [kg] at the tip, that is carried untold
     friction_max: F64  # (n,) [Nm] the same of friction, and of what the drives are wrong by
     noticeable: F64  # (n,) [Nm] more than this of an external torque is more than rounding

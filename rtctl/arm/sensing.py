@@ -90,7 +90,7 @@ def plausible_feedback(c: RecordRow, m: RecordRow, f: Feedback) -> tuple[Feedbac
                 implausible = implausible or found[i]
                 q[i], age[i], replies[i] = m.q_previous[i], min(before[i] + elapsed, c.safety_lost_periods * c.dt), 0
     return (
-        Feedback(f.slot, f.missed, q, f.qd, f.tau, age, replies, f.drive, f.link, f.lateness, f.compute),
+        Feedback(f.slot, f.missed, q, f.qd, f.tau, age, replies, f.drive, f.link, f.lateness, f.compute, f.grippers),
         implausible,
     )
 

@@ -99,6 +99,13 @@ def add(commands: Commands) -> None:
         "com", metavar="X Y Z", type=number, nargs="*", help="its centre in the tip's frame [m] (0 0 0)"
     )
     add_daemon(payload)
+    grip = command(commands, "grip", "move the gripper", "rtctl grip 1 --force 20", _grip)
+    grip.add_argument("closed", metavar="SHARE", type=number, help="0 open … 1 closed")
+    grip.add_argument("--force", metavar="N", type=positive, help="between the jaws at most (what the file allows)")
+    grip.add_argument("--name", metavar="NAME", default="", help="of the gripper (every one)")
+    grip.add_argument("--timeout", metavar="S", type=positive, default=10.0, help="to be there (%(default)s s)")
+    _add_no_wait(grip)
+    add_daemon(grip)
     status = command(commands, "status", "show how things stand", "rtctl status --watch", _status)
     status.add_argument("--watch", action="store_true", help="keep showing, ten times a second")
     status.add_argument("--json", action="store_true", help="print the daemon's reply; with --watch one a line")
@@ -173,6 +180,18 @@ def _payload(arguments: argparse.Namespace) -> int:
     message: Json = {"verb": "payload", "mass_kg": arguments.mass}
     message |= {"com_m": arguments.com} if arguments.com else {}
     return _said(_demand(arguments, message), f"payload: {arguments.mass:g} kg")
+
+
+def _grip(arguments: argparse.Namespace) -> int:
+    from rtctl.cli.waiting import gripped, ready_session, told
+
+    message: Json = {"verb": "grip", "closed": arguments.closed, "force_N": arguments.force or 0.0}
+    message |= {"name": arguments.name} if arguments.name else {}
+    if arguments.no_wait:
+        return _said(_demand(arguments, message), "grip: accepted")
+    _checked(message)
+    with ready_session(arguments, "grip", 0.0) as session:
+        return told("grip", gripped(session, message, arguments.timeout))
 
 
 def _set(arguments: argparse.Namespace) -> int:

@@ -80,6 +80,9 @@ def render(status: Json) -> RenderableType:
         parts += [Text(), Text(f"vehicle {_vehicle(status['vehicle'])}")]
     else:
         parts += [Text(), Text(f"joints  {_joints(status.get('q_rad') or ())} deg")]
+    for gripper in status.get("grippers") or ():
+        held = f"{gripper['closed']:.2f} of closed, {gripper['force_N']:.1f} N"
+        parts.append(Text(f"{gripper['name']} {gripper['state']} at {held}"))
     faults = status.get("faults") or ()
     parts.append(Text(f"faults  {', '.join(map(str, faults)) or 'none'}", style="bold red" if faults else "dim"))
     log = status.get("log")

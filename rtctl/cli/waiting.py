@@ -76,6 +76,27 @@ def ready_session(arguments: argparse.Namespace, verb: str, patience: float = PA
             raise LinkError(f"{path}: the daemon ended while it started; it has said why where it was started")
 
 
+def gripped(session: Session, message: Json, timeout: float) -> End:
+    """Tell grippers where to go and wait until they are there or hold something. Raises RequestError, LinkError."""
+    accepted(session.ask(message))
+    begun, notes = time.monotonic(), Notes("grip")
+    while True:
+        time.sleep(POLL)
+        found = [g for g in accepted(session.ask({"verb": "status"})).get("grippers", ()) if _meant(g, message)]
+        words = "; ".join(f"{g['name']} {g['state']} at {g['closed']:.2f}, {g['force_N']:.1f} N" for g in found)
+        if all(g["state"] in ("there", "gripping") for g in found):
+            return End(True, words)
+        if any(g["state"] in ("silent", "fault", "off") for g in found):
+            return End(False, words)
+        if time.monotonic() - begun > timeout:
+            return End(False, f"{words} still after {timeout:g} s")
+        notes.say(f"waiting until it is there or holds something (at most {timeout:g} s; --no-wait does not wait)", "")
+
+
+def _meant(gripper: Json, message: Json) -> bool:
+    return not message.get("name") or gripper["name"] == message["name"]
+
+
 def _doing(session: Session) -> str:
     """Return what a daemon that starts is doing, '' for one that is ready."""
     try:

@@ -10,6 +10,7 @@ from rtctl.arm.encoders import SHARE
 from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
 from rtctl.arm.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
+from rtctl.arm.gripper import Gripper
 from rtctl.arm.law import prepared
 from rtctl.arm.model import NOTHING, Load, Model, RigidBody
 from rtctl.arm.osc import MotionParams
@@ -29,7 +30,7 @@ from rtctl.spec import rules
 from rtctl.spec.goal import task_of
 from rtctl.spec.obstacles import Obstacle, quaternion, shape_of
 from rtctl.spec.read import name_place
-from rtctl.spec.robot import Config
+from rtctl.spec.robot import Config, GripperTable
 from rtctl.spec.urdf import package_folders, urdf_file
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import distance
@@ -54,6 +55,21 @@ class Extremes(NamedTuple):
     tool: F64  # (n,) [Nm] largest torque of the tool's weight
     payload: F64  # (n,) [Nm] largest |g_i| with payload_max_kg at the tip
     payload_home: F64  # (n,) [Nm] the same at home
+
+
+def gripper_of(table: GripperTable) -> Gripper:
+    """Return a gripper in the units of its drive."""
+    lever = table.travel_m / abs(table.closed_rad - table.open_rad)
+    return Gripper(
+        name=table.name,
+        open=table.open_rad,
+        closed=table.closed_rad,
+        lever=lever,
+        torque=table.force_max_N * lever,
+        speed=table.speed_m_s / lever,
+        kp=table.kp_Nm_rad,
+        kd=table.kd_Nms_rad,
+    )
 
 
 def build(config: Config, path: str | Path) -> Robot:
@@ -89,6 +105,7 @@ def build(config: Config, path: str | Path) -> Robot:
         tau_max=config.safety.torque_ratio * tau_rated,
         tau_rated=tau_rated,
         tau_rate=np.array([j.tau_rate_Nm_s for j in joints]),
+        grippers=tuple(map(gripper_of, config.gripper)),
         payload_max=config.robot.payload_max_kg,
         friction_max=config.safety.friction_ratio * tau_rated,
         noticeable=NOTICEABLE * tau_rated,

@@ -32,7 +32,7 @@ from rtctl.spec.obstacles import (
 )
 from rtctl.spec.read import convert, type_info
 from rtctl.spec.robot import Angles
-from rtctl.types import Goal, ObstacleEdit, Payload, Request, Task, Verb
+from rtctl.types import Goal, Grip, ObstacleEdit, Payload, Request, Task, Verb
 
 OBSTACLES_MAX = 64  # in one camera frame
 CLOUD_MARK = b"RTCLOUD1"
@@ -104,6 +104,14 @@ class PayloadMessage(_Message, tag="payload", frozen=True, kw_only=True):
         0.0,
         0.0,
     )
+
+
+class GripMessage(_Message, tag="grip", frozen=True, kw_only=True):
+    """Move a gripper, or every one, to a share of its way with a force at most; 0 N: its own bound."""
+
+    closed: Annotated[float, Meta(ge=0.0, le=1.0, description="0 open, 1 closed")]
+    force_N: Annotated[float, Meta(ge=0.0, le=2000.0)] = 0.0
+    name: Annotated[str, Meta(max_length=32)] = ""
 
 
 class Status(_Message, tag="status", frozen=True):
@@ -179,6 +187,7 @@ Message = (
     | Float
     | Hold
     | PayloadMessage
+    | GripMessage
     | Status
     | World
     | GoalMessage
@@ -302,6 +311,10 @@ def request_of(
             if bounds.local is not None:
                 raise RequestError("payload: a base carries what it carries, wanted an arm")
             return Request(payload=Payload(message.mass_kg, *message.com_m))
+        case GripMessage():
+            if bounds.local is not None:
+                raise RequestError("grip: a base has no gripper, wanted an arm")
+            return Request(grip=Grip(message.closed, message.force_N, message.name))
         case Status() | World():
             return Request()
         case Disarm(drop=True):

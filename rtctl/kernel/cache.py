@@ -26,6 +26,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from rtctl.trust import TrustError, own_folder
 
 PATIENCE = 300.0  # [s] for another process that compiles the same function; then it is compiled here too
+ATTEMPTS = 3  # to make a folder that others let go of
 VERSIONS = 8  # of a module's kernels that are kept, the latest used
 
 _FROM = re.compile(rb"^[ \t]*from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -168,19 +169,32 @@ class KernelCache(FunctionCache):
         return found
 
     def save_overload(self, sig: object, data: object) -> None:
-        """Save what was compiled, and let the others have it."""
+        """Save what was compiled, and let the others have it.
+
+        A process of another version may have let go of the folder meanwhile; what cannot be kept is compiled again.
+        """
         save: Callable[[object, object], None] = super().save_overload
         try:
-            save(sig, data)
+            with suppress(OSError):
+                try:
+                    save(sig, data)
+                except FileNotFoundError:
+                    self._impl.locator.ensure_cache_path()
+                    save(sig, data)
         finally:
             self._release()
 
     def _take(self) -> None:
         if self._lock < 0:
             locator: _Locator = self._impl.locator
-            locator.ensure_cache_path()
             path = locator.path / f"{self._impl.filename_base}.lock"
-            self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            for _ in range(ATTEMPTS):
+                with suppress(FileNotFoundError):
+                    locator.ensure_cache_path()
+                    self._lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+                    break
+            else:
+                return  # compiled here, whatever others do
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             with suppress(BlockingIOError):

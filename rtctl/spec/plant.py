@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from rtctl.spec.obstacles import Length
-from rtctl.spec.robot import Key, Table
+from rtctl.spec.robot import Key, Table, Text
 
 Factor = Annotated[float, Meta(ge=-0.9, le=10.0)]
 ByLink = Annotated[dict[Key, Factor], Meta(max_length=64)]
@@ -68,15 +68,14 @@ class PlantTable(Table, frozen=True, kw_only=True):
     talker_ids: Annotated[
         tuple[CanId, ...], Meta(max_length=8, description="on each of them somebody else sends a frame every period")
     ] = ()
+    gripper_thing: Annotated[
+        float, Meta(ge=0.0, le=2.0, description="share of its way at which a gripper meets a thing; above 1: nothing")
+    ] = 2.0
     engine: Annotated[Literal["bullet", "mujoco"], Meta(description="what moves the arm")] = "bullet"
     model: (
         Annotated[
-            str,
-            Meta(
-                min_length=1,
-                max_length=4096,
-                description="MJCF that moves in the place of the URDF: a path beside the robot file, or package://",
-            ),
+            Text,
+            Meta(description="MJCF that moves in the place of the URDF: a path beside the robot file, or package://"),
         ]
         | None
     ) = None

@@ -56,6 +56,22 @@ class Joint(Table, frozen=True, kw_only=True):
     ] = False
 
 
+class GripperTable(Table, frozen=True, kw_only=True):
+    """A gripper whose drive is on the arm's bus; `rtctl grip 0..1 [--force N]` moves it."""
+
+    name: Name = "gripper"
+    can_id: Annotated[int, Meta(ge=1, le=0x7F, description="motor id")]
+    reply_id: Annotated[int, Meta(ge=1, le=0x7FE, description="of its replies; default: can_id + 0x10")] | None = None
+    drive: Annotated[Name, Meta(description="a drive of the catalogue or of [drives]: its scales on the wire")]
+    open_rad: Annotated[Angle, Meta(description="what the drive reads where it is open")]
+    closed_rad: Annotated[Angle, Meta(description="and where it is closed")]
+    travel_m: Annotated[float, Meta(ge=1e-3, le=1.0, description="opening of the jaws, from closed to open")]
+    force_max_N: Annotated[float, Meta(ge=0.1, le=2000.0, description="between the jaws")]
+    speed_m_s: Annotated[float, Meta(ge=1e-3, le=2.0, description="of the opening")] = 0.1
+    kp_Nm_rad: Annotated[float, Meta(ge=0.1, le=500.0, description="of its drive's loop")] = 10.0
+    kd_Nms_rad: Annotated[float, Meta(ge=0.01, le=5.0)] = 1.0
+
+
 class BasePose(Table, frozen=True, kw_only=True):
     """Where the arm's base stands in the world."""
 
@@ -305,6 +321,7 @@ class Config(Table, frozen=True, kw_only=True):
     safety: Safety
     log: LogTable
     tool: ToolTable | None = None
+    gripper: Annotated[tuple[GripperTable, ...], Meta(max_length=4)] = ()
     estimator: Estimator = Estimator()
     console: ConsoleTable = ConsoleTable()
     drives: Annotated[dict[Name, DriveTable], Meta(max_length=64)] = {}

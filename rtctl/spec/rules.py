@@ -12,7 +12,7 @@ from rtctl.protocol.mit import Scale
 from rtctl.spec.bus import LOAD_MAX, Load, cycle_load
 from rtctl.spec.obstacles import orientation_contradiction, refuse_obstacles
 from rtctl.spec.read import name_place
-from rtctl.spec.robot import Config, Joint
+from rtctl.spec.robot import Config, GripperTable, Joint
 from rtctl.spell import nearest
 
 
@@ -26,7 +26,7 @@ class Found(NamedTuple):
 
 def refuse(config: Config, source: str) -> None:
     """Raise ConfigError for the first contradiction between the keys of `config`."""
-    for group in (_available, _names, _drives, _tool, _rates, _distances, _slots, _postures, _link):
+    for group in (_available, _names, _drives, _grippers, _tool, _rates, _distances, _slots, _postures, _link):
         for found in group(config):
             raise ConfigError(name_place(source, found.path), found.got, found.wanted)
     refuse_obstacles(config.obstacle, source)
@@ -36,8 +36,8 @@ def refuse(config: Config, source: str) -> None:
             raise ConfigError(place, f"{o.name}, which moves", "one at rest; moving obstacles belong in a scenario")
 
 
-def reply_id(joint: Joint) -> int:
-    """Return the identifier of a joint's replies."""
+def reply_id(joint: Joint | GripperTable) -> int:
+    """Return the identifier of the replies of a joint's drive, or a gripper's."""
     return joint.can_id + mit.REPLY_OFFSET if joint.reply_id is None else joint.reply_id
 
 
@@ -63,7 +63,9 @@ def bus_load(config: Config) -> Load:
     """Return the load of the configured bus at worst-case stuffing."""
     payload = e2e.LENGTH if config.link.protocol == "mit+e2e" else mit.LENGTH
     rate = config.link.data_bitrate if config.link.fd else None
-    return cycle_load(len(config.robot.joints), payload, config.link.bitrate, rate, 1.0 / config.loop.servo_hz)
+    return cycle_load(
+        len(config.robot.joints) + len(config.gripper), payload, config.link.bitrate, rate, 1.0 / config.loop.servo_hz
+    )
 
 
 def braking_distance(config: Config) -> float:
@@ -124,6 +126,36 @@ def _drives(c: Config) -> Iterator[Found]:
             if abs(p) > scale.p_max:
                 reads = f"; the drive reads {p:g} there" if p != q else ""
                 yield Found(at + key, q, f"within p_max = +-{scale.p_max:g} {of}{reads}")
+
+
+def _grippers(c: Config) -> Iterator[Found]:
+    joints: list[Joint | GripperTable] = [*c.robot.joints, *c.gripper]
+    for k, gripper in enumerate(c.gripper):
+        at, others = f"gripper[{k}].", joints[: len(c.robot.joints) + k]
+        taken = {id_: o.name for o in others for id_ in (o.can_id, reply_id(o))}
+        for key, value in (("can_id", gripper.can_id), ("reply_id", reply_id(gripper))):
+            if value in taken:
+                yield Found(at + key, value, f"one that {taken[value]} does not have")
+        if gripper.name in [o.name for o in others]:
+            yield Found(at + "name", gripper.name, "one that no joint and no other gripper has")
+        if c.link.protocol != "mit":
+            yield Found("link.protocol", c.link.protocol, "mit: a gripper's drive speaks no other")
+        scale = scale_of(c, gripper.drive)
+        if scale is None:
+            known = [*c.drives, *mit.DRIVES]
+            wanted = f"{nearest(gripper.drive, known)}; or a table [drives.{gripper.drive}]"
+            yield Found(at + "drive", gripper.drive, wanted)
+            continue
+        way = abs(gripper.closed_rad - gripper.open_rad)
+        if way < 0.05:
+            yield Found(at + "closed_rad", gripper.closed_rad, "at least 0.05 rad from open_rad")
+            continue
+        for key in ("open_rad", "closed_rad"):
+            if abs(getattr(gripper, key)) > scale.p_max:
+                yield Found(at + key, getattr(gripper, key), f"within +-{scale.p_max:g} rad of drive {gripper.drive}")
+        most = scale.t_max * way / gripper.travel_m
+        if gripper.force_max_N > most:
+            yield Found(at + "force_max_N", gripper.force_max_N, f"at most {most:.4g}: t_max over the jaws' lever")
 
 
 def _tool(c: Config) -> Iterator[Found]:

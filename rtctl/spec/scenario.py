@@ -70,6 +70,14 @@ class FaultTable(Table, frozen=True, kw_only=True):
     value: Annotated[float, Meta(ge=-1e4, le=1e4, description="how much, where the kind has a size")] | None = None
 
 
+class GripTable(Table, frozen=True, kw_only=True):
+    """What a gripper is asked at a time."""
+
+    at_s: Moment
+    closed: Annotated[float, Meta(ge=0.0, le=1.0, description="0 open, 1 closed")]
+    force_N: Annotated[float, Meta(ge=0.0, le=2000.0, description="at most; 0: its own bound")] = 0.0
+
+
 class Scenario(Table, frozen=True, kw_only=True):
     """What happens to a robot over a stretch of time."""
 
@@ -84,6 +92,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     goal: Annotated[tuple[TimedGoal, ...], Meta(max_length=10_000)] = ()
     obstacle: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
     fault: Annotated[tuple[FaultTable, ...], Meta(max_length=1000)] = ()
+    grip: Annotated[tuple[GripTable, ...], Meta(max_length=10_000)] = ()
     plant: PlantTable | None = None  # None: the simulated arm is as described
 
 

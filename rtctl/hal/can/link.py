@@ -48,6 +48,7 @@ class LinkSpec(NamedTuple):
     fd: bool  # frames are CAN FD with bit-rate switch; MIT_E2E needs it
     period: float  # [s] of the servo loop
     watchdog: float  # [s] W: a drive that hears nothing for longer stops by itself
+    grippers: int = 0  # the last of `joints` that are none of the arm's, but grippers
 
 
 def identifiers(joints: Iterable[JointSpec]) -> tuple[int, ...]:
@@ -62,6 +63,8 @@ class CanLink:
     def __init__(self, spec: LinkSpec, transport: Transport) -> None:
         n = len(spec.joints)
         self.spec, self.transport = spec, transport
+        self.n = n - spec.grippers  # joints of the arm
+        self._grip: F64 = np.zeros((5, spec.grippers))  # the last command of grippers: kept up without one
         self.protected = spec.protocol == MIT_E2E
         self.received: Sequence[bytes] = []  # raw frames of the last read
         self.corrupt = self.ignored = self.foreign = 0  # frames so far
@@ -105,6 +108,9 @@ class CanLink:
         self._mountings = mountings
         self._fields = [fields_of(drive.scale, drive.mounting) for drive in drives]
         self._cycle = batch.cycle_of(self.protected, self.spec.fd, drives)
+        self._commands = (
+            batch.cycle_of(self.protected, self.spec.fd, drives[: self.n]) if self.spec.grippers else self._cycle
+        )
 
     # ---- out
 
@@ -128,19 +134,30 @@ class CanLink:
         self._counters[joint] = counter & 0xFF
 
     def write(self, command: Command) -> Sequence[bytes]:
-        """Send one frame to each joint, or drop it; return the raw frames that went out."""
-        if command.hold is not None:
-            return self.transport.send_all(Frames(self._held(command.tau, command.hold), self._size))
+        """Send one frame to each gripper and each joint, or drop it; return the raw frames that went out."""
         special = _SPECIAL.get(command.drive)
-        if special is None:
-            return self.transport.send_all(batch.encode(self._cycle, command.tau, self._counters))
-        frames = b"".join([self.encode(j, special) for j in range(len(self.spec.joints))])
-        return self.transport.send_all(Frames(frames, self._size))
+        if special is not None:
+            order = (*range(self.n, len(self.spec.joints)), *range(self.n))
+            return self.transport.send_all(Frames(b"".join([self.encode(j, special) for j in order]), self._size))
+        if command.hold is not None:
+            frames = Frames(self._held(command.tau, command.hold), self._size)
+        else:
+            frames = batch.encode(self._commands, command.tau, self._counters)
+        if self.spec.grippers:  # first: who closes a period with the arm's last frame has heard them
+            frames = Frames(self._gripped(command.grippers) + frames.data, self._size)
+        return self.transport.send_all(frames)
+
+    def _gripped(self, commands: F64) -> bytes:
+        """Return a frame for each gripper; commands (5, g), as it was where there are none."""
+        self._grip = commands if commands.shape[1] else self._grip
+        rows = zip(self.spec.joints[self.n :], self._grip.T.tolist(), strict=True)
+        data = [mit.encode_command(p, v, kp, kd, t, joint.scale) for joint, (p, v, kp, kd, t) in rows]
+        return b"".join([self.encode(self.n + k, each) for k, each in enumerate(data)])
 
     def _held(self, tau: F64, hold: Hold) -> bytes:
         """Return a frame for each joint that has its drive hold it by its own loop, or a disable frame."""
         frames = []
-        for j, joint in enumerate(self.spec.joints):
+        for j, joint in enumerate(self.spec.joints[: self.n]):
             if hold.off[j]:
                 frames.append(self.encode(j, mit.DISABLE))
                 continue
@@ -168,9 +185,14 @@ class CanLink:
             self._flags |= _DERATED
         if self._flags & _DOWN:
             self._reopen(slot)
-        q, qd, tau, age = self._state
-        codes = self._codes
-        return Feedback(slot, missed, q, qd, tau, age, codes[5], codes[0], int(self._flags), lateness, compute)
+        state, codes, n = self._state, self._codes, self.n
+        link = int(self._flags)
+        if not self.spec.grippers:
+            q, qd, tau, age = state
+            return Feedback(slot, missed, q, qd, tau, age, codes[5], codes[0], link, lateness, compute)
+        q, qd, tau, age = state[:, :n]
+        grippers = np.vstack((state[:, n:], codes[0, n:].astype(np.float64)))
+        return Feedback(slot, missed, q, qd, tau, age, codes[5, :n], codes[0, :n], link, lateness, compute, grippers)
 
     def joint_of(self, raw: bytes) -> int | None:
         """Return the joint that a raw frame is a reply of, or None."""
@@ -214,7 +236,7 @@ class CanLink:
         self._codes[5] = 0
         for raw in self.received:
             self._take(raw, asked)
-        if self._codes[5].max() > 1:
+        if self._codes[5, : self.n].max() > 1:
             self._flags |= _DUPLICATE
         if self.receivers.disorder.max() == e2e.DISORDER_LIMIT:
             self._flags |= _DISORDER

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.arm.record import grippers_seen
 from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.mcap.walk import I64_MAX
@@ -30,6 +31,7 @@ def feedbacks_of(records: Structured) -> Iterator[Feedback]:
     """Yield the feedback that each record was made from."""
     q, qd, tau, age = (np.ascontiguousarray(records[name]) for name in ("q", "qd", "tau_measured", "age"))
     replies, drive = (records[name].astype(np.int64) for name in ("replies", "drive"))
+    grippers = grippers_seen(records)
     scalars = ("slot", "missed", "link", "lateness", "compute")
     rows = zip(*(records[name].tolist() for name in scalars), strict=True)
     for k, (slot, missed, link, lateness, compute) in enumerate(rows):
@@ -45,6 +47,7 @@ def feedbacks_of(records: Structured) -> Iterator[Feedback]:
             link=link,
             lateness=lateness,
             compute=compute,
+            grippers=grippers[k],
         )
 
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from rtctl.plain import Json
-from rtctl.types import Advice, Goal, ObstacleEdit, Payload, Request, Shape, Task, Verb
+from rtctl.types import Advice, Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
@@ -23,6 +23,8 @@ def encode_request(tick: int, request: Request) -> bytes:
         ]
     if request.payload is not None:
         body["payload"] = tuple(request.payload)
+    if request.grip is not None:
+        body["grip"] = tuple(request.grip)
     return msgspec.json.encode(body)
 
 
@@ -47,6 +49,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
             edits,
             payload,
             None if advice is None else _advice(advice),
+            _grip(body),
         )
         return int(body["tick"]), asked
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
@@ -84,6 +87,13 @@ def _shape_of(body: Json) -> Shape:
 
 def _advice(body: Json) -> Advice:
     return Advice(np.array(body["posture"], np.float64), bool(body["leads"]), bool(body["clear"]))
+
+
+def _grip(body: Json) -> Grip | None:
+    if body.get("grip") is None:
+        return None
+    closed, force, name = body["grip"]
+    return Grip(float(closed), float(force), str(name))
 
 
 def _goal(body: Json) -> Goal:
