@@ -11,6 +11,7 @@ from rtctl import design as cfg
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate
 from rtctl.arm.gripper import Gripper, P, Q, gripped, state_of, unasked
+from rtctl.arm.pipe import tick
 from rtctl.errors import ConfigError, RequestError
 from rtctl.hal import messages
 from rtctl.log.read.run import read_run
@@ -92,6 +93,15 @@ def test_a_silent_gripper_is_told_and_the_arm_goes_on():
         assert not here.memory.in_force
         assert word(here) == "silent"
         assert ("gripper", "gripper: silent at 0.00 of closed") in [e[1:] for e in here.servo.events]
+
+
+def test_feedback_that_knows_of_no_gripper_is_one_of_a_silent_gripper():
+    with lab(path=OPENARM) as here:
+        feedback = here.running().turns[-1].feedback._replace(grippers=NO_GRIPPERS)
+        m, command, record = tick(here.robot, here.memory, feedback, Request())
+    assert state_of(here.robot.grippers[0], m.grippers[:, 0]) == "silent"
+    assert command.grippers.shape == (5, 1)
+    assert record["gripper_age"].tolist() == [[np.inf]]
 
 
 # ---- log and replay

@@ -52,6 +52,13 @@ def unasked(count: int) -> F64:
     return memory
 
 
+def silent(count: int) -> F64:
+    """Return what is seen of grippers that have never been heard, (5, count)."""
+    seen: F64 = np.zeros((5, count))
+    seen[AGE] = np.inf
+    return seen
+
+
 def refused(grippers: tuple[Gripper, ...], asked: Grip, driven: bool) -> str:
     """Return why a request cannot be followed, '' where it can."""
     if not grippers:

@@ -11,7 +11,7 @@ from rtctl.arm.escape import Escape
 from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import parameters_of, shapes_of, table_of
-from rtctl.arm.gripper import DRIVEN, gripped, refused, unasked
+from rtctl.arm.gripper import DRIVEN, gripped, refused, silent, unasked
 from rtctl.arm.law import REVIEW
 from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
 from rtctl.arm.model import Model
@@ -121,9 +121,10 @@ def _gripped(
     feedback, request = came
     why = "" if request.grip is None else refused(robot.grippers, request.grip, command.drive in DRIVEN)
     asked, elapsed = None if why else request.grip, robot.dt * (1 + min(feedback.missed, MISSED_MAX))
-    memory, command = gripped(robot.grippers, m.grippers, feedback.grippers, asked, command, elapsed)
+    seen = feedback.grippers if feedback.grippers.shape[1] == len(robot.grippers) else silent(len(robot.grippers))
+    memory, command = gripped(robot.grippers, m.grippers, seen, asked, command, elapsed)
     m = m._replace(grippers=memory, refusal=why or m.refusal)
-    return m, command, with_grippers(record, feedback.grippers, memory) if robot.grippers else record
+    return m, command, with_grippers(record, seen, memory) if robot.grippers else record
 
 
 def initial(robot: Robot, feedback: Feedback) -> Memory:
