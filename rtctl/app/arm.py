@@ -161,7 +161,7 @@ def grip_status(gripper: Gripper, memory: F64) -> Json:
         "name": gripper.name,
         "state": state_of(gripper, memory),
         "closed": gripper.share(float(seen[Q])),
-        "wanted": None if np.isnan(target) else gripper.share(target),
+        "wanted": None if np.isinf(target) else gripper.share(target),
         "force_N": abs(float(seen[TAU])) / gripper.lever,
         "force_max_N": float(memory[TORQUE]) / gripper.lever,
     }

@@ -15,7 +15,7 @@ import numpy as np
 from rtctl.types import F64, Command, Drive, Grip
 
 Q, QD, TAU, AGE, STATUS = range(5)  # rows of Feedback.grippers
-TARGET, TORQUE, P, STILL, SEEN = range(5)  # rows of Memory.grippers: [rad], nan none; [Nm]; [rad]; [s] at rest; seen
+TARGET, TORQUE, P, STILL, SEEN = range(5)  # rows of Memory.grippers: [rad], inf none; [Nm]; [rad]; [s] at rest; seen
 ENABLED: Final = 1  # drive status
 LATE: Final = 0.1  # [s] without a reply, after which it is silent
 NEAR: Final = 0.02  # of its way: there
@@ -48,7 +48,7 @@ class Gripper(NamedTuple):
 def unasked(count: int) -> F64:
     """Return what grippers remember before anybody asked them for anything, (9, count)."""
     memory: F64 = np.zeros((SEEN + 5, count))
-    memory[TARGET] = np.nan
+    memory[TARGET] = np.inf
     return memory
 
 
@@ -85,13 +85,13 @@ def gripped(
     for k, g in enumerate(grippers):
         q = float(seen[Q, k])
         if not driven:
-            m[:SEEN, k] = np.nan, g.torque, q, 0.0
+            m[:SEEN, k] = np.inf, g.torque, q, 0.0
             continue
         if asked is not None and asked.name in ("", g.name):
             m[TARGET, k], m[STILL, k] = g.angle(asked.closed), 0.0
             m[TORQUE, k] = asked.force * g.lever if asked.force > 0.0 else g.torque
         before = float(m[P, k])
-        target = before if np.isnan(m[TARGET, k]) else float(m[TARGET, k])
+        target = before if np.isinf(m[TARGET, k]) else float(m[TARGET, k])
         p = before + min(max(target - before, -g.speed * dt), g.speed * dt)
         away = m[TORQUE, k] / g.kp
         held = min(max(p, q - away), q + away)
@@ -111,7 +111,7 @@ def state_of(gripper: Gripper, memory: F64) -> str:
         return "fault"
     if seen[STATUS] != ENABLED:
         return "off"
-    if np.isnan(memory[TARGET]):
+    if np.isinf(memory[TARGET]):
         return "holding"
     if abs(gripper.share(float(seen[Q])) - gripper.share(float(memory[TARGET]))) < NEAR:
         return "there"
