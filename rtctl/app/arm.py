@@ -30,7 +30,7 @@ from rtctl.app.vehicle import (
     clearances,
 )
 from rtctl.arm import faults, task
-from rtctl.arm.gripper import SEEN, TARGET, TAU, TORQUE, Gripper, Q, state_of
+from rtctl.arm.gripper import ASKED, SEEN, TARGET, TAU, TORQUE, Gripper, Q, state_of
 from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
 from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial, tick, warm
@@ -155,13 +155,13 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
 
 
 def grip_status(gripper: Gripper, memory: F64) -> Json:
-    """Return what `rtctl status` shows of a gripper; memory (9,)."""
-    target, seen = float(memory[TARGET]), memory[SEEN:]
+    """Return what `rtctl status` shows of a gripper; memory (10,)."""
+    seen = memory[SEEN:]
     return {
         "name": gripper.name,
         "state": state_of(gripper, memory),
         "closed": gripper.share(float(seen[Q])),
-        "wanted": None if np.isinf(target) else gripper.share(target),
+        "wanted": gripper.share(float(memory[TARGET])) if memory[ASKED] else None,
         "force_N": abs(float(seen[TAU])) / gripper.lever,
         "force_max_N": float(memory[TORQUE]) / gripper.lever,
     }

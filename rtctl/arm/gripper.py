@@ -15,7 +15,9 @@ import numpy as np
 from rtctl.types import F64, Command, Drive, Grip
 
 Q, QD, TAU, AGE, STATUS = range(5)  # rows of Feedback.grippers
-TARGET, TORQUE, P, STILL, SEEN = range(5)  # rows of Memory.grippers: [rad], inf none; [Nm]; [rad]; [s] at rest; seen
+TARGET, TORQUE, P, STILL, ASKED = range(5)  # rows of Memory.grippers: [rad]; [Nm]; [rad]; [s] at rest; 1 or 0
+SEEN = 5  # the rows from here on: what was seen last
+NEVER: Final = 1e3  # [s] age of what was never heard
 ENABLED: Final = 1  # drive status
 LATE: Final = 0.1  # [s] without a reply, after which it is silent
 NEAR: Final = 0.02  # of its way: there
@@ -46,16 +48,14 @@ class Gripper(NamedTuple):
 
 
 def unasked(count: int) -> F64:
-    """Return what grippers remember before anybody asked them for anything, (9, count)."""
-    memory: F64 = np.zeros((SEEN + 5, count))
-    memory[TARGET] = np.inf
-    return memory
+    """Return what grippers remember before anybody asked them for anything, (10, count)."""
+    return np.zeros((SEEN + 5, count))
 
 
 def silent(count: int) -> F64:
     """Return what is seen of grippers that have never been heard, (5, count)."""
     seen: F64 = np.zeros((5, count))
-    seen[AGE] = np.inf
+    seen[AGE] = NEVER
     return seen
 
 
@@ -76,23 +76,22 @@ def refused(grippers: tuple[Gripper, ...], asked: Grip, driven: bool) -> str:
 def gripped(
     grippers: tuple[Gripper, ...], memory: F64, seen: F64, asked: Grip | None, command: Command, dt: float
 ) -> tuple[F64, Command]:
-    """Return what grippers remember (9, g), and the command with theirs in it, a slot of dt [s] later.
+    """Return what grippers remember (10, g), and the command with theirs in it, a slot of dt [s] later.
 
-    memory: (9, g), see TARGET. seen: (5, g), see Q. asked: a request that is not refused.
+    memory: (10, g), see TARGET. seen: (5, g), see Q. asked: a request that is not refused.
     """
     m, out = np.vstack((memory[:SEEN], seen)), np.zeros((5, len(grippers)))
     driven = command.drive in DRIVEN
     for k, g in enumerate(grippers):
         q = float(seen[Q, k])
         if not driven:
-            m[:SEEN, k] = np.inf, g.torque, q, 0.0
+            m[:SEEN, k] = q, g.torque, q, 0.0, 0.0
             continue
         if asked is not None and asked.name in ("", g.name):
-            m[TARGET, k], m[STILL, k] = g.angle(asked.closed), 0.0
+            m[TARGET, k], m[STILL, k], m[ASKED, k] = g.angle(asked.closed), 0.0, 1.0
             m[TORQUE, k] = asked.force * g.lever if asked.force > 0.0 else g.torque
         before = float(m[P, k])
-        target = before if np.isinf(m[TARGET, k]) else float(m[TARGET, k])
-        p = before + min(max(target - before, -g.speed * dt), g.speed * dt)
+        p = before + min(max(float(m[TARGET, k]) - before, -g.speed * dt), g.speed * dt)
         away = m[TORQUE, k] / g.kp
         held = min(max(p, q - away), q + away)
         m[P, k] = held
@@ -103,7 +102,7 @@ def gripped(
 
 
 def state_of(gripper: Gripper, memory: F64) -> str:
-    """Return in a word how a gripper is; memory (9,)."""
+    """Return in a word how a gripper is; memory (10,)."""
     seen = memory[SEEN:]
     if seen[AGE] > LATE:
         return "silent"
@@ -111,7 +110,7 @@ def state_of(gripper: Gripper, memory: F64) -> str:
         return "fault"
     if seen[STATUS] != ENABLED:
         return "off"
-    if np.isinf(memory[TARGET]):
+    if not memory[ASKED]:
         return "holding"
     if abs(gripper.share(float(seen[Q])) - gripper.share(float(memory[TARGET]))) < NEAR:
         return "there"

@@ -201,7 +201,7 @@ class Memory(msgspec.Struct, frozen=True):
     table: F64  # where they are now, and how far from arm and goal; see `flat`
     shapes: F64  # what does not change of them between edits
     ends: F64  # (m, 3) [m] the points in the goal's posture, where there is one
-    grippers: F64  # (9, g) what its grippers remember; see `gripper`
+    grippers: F64  # (10, g) what its grippers remember; see `gripper`
 
     def __getattr__(self, name: str) -> Any:
         """Return a field of the hot record, as the type that it stands for."""

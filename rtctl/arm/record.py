@@ -84,7 +84,7 @@ SCALARS = record_dtype(0, 0).itemsize  # bytes of what does not depend on joints
 
 
 def with_grippers(record: Record, seen: F64, memory: F64) -> Record:
-    """Return a record with g grippers behind it; seen (5, g) as in Feedback, memory (9, g) as in Memory."""
+    """Return a record with g grippers behind it; seen (5, g) as in Feedback, memory (10, g) as in Memory."""
     tail = np.concatenate((seen, memory[: len(GRIPPER) - len(SEEN)]))
     n, slots = record["q"].shape[1], record["rho"].shape[1]
     both = bytearray(record.tobytes() + tail.astype("<f8").tobytes())
