@@ -135,7 +135,8 @@ def test_jaws_that_close_the_other_way_press_with_the_force_and_no_more(reversed
 
 def unreliable(here: Lab, passes: Callable[[int], int]) -> None:
     """Let replies of the gripper come late or never: passes(k) of those that wait after exchange k get through."""
-    heard, waiting = here.link.transport._exchange, []
+    heard = here.link.transport._exchange
+    waiting: list[bytes] = []
     count = iter(range(10**9))
 
     def exchange(frames: Any) -> list[bytes]:
