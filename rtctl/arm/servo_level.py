@@ -48,8 +48,8 @@ MISSED_MAX = 10  # slots that estimates coast through; more is a fault
 REST_HOLD = 0.1  # [s] at rest before the drives are disabled
 SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque builds up at its rate limit
 ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
-FADE = 0.01  # [s] in which the torque of a stop without true measurements goes
-FASTER = 0.3  # [rad/s] above its speed at the onset of a stop: the joint is driven, not damped
+FADE = 0.004  # [s] in which the torque of a stop without true measurements goes: a deaf drive gives its last on
+FASTER = 0.2  # [rad/s] above its speed at the onset of a stop: the joint is driven, not damped; brakes take their time
 STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushing, brakes do the rest
 
 # numbers of the enumerations, as compiled code reads them
