@@ -19,7 +19,7 @@ def test_each_sort_of_trouble_of_the_ordeal_has_a_step():
     assert {"pause_daemon", "pause_drives", "pause_recorder", "garbage", "crowd"} <= names
 
 
-REST = Truth(1.0, [0.0] * 2, [0.0] * 2, [0.0] * 2, [True] * 2, [], 0)
+REST = Truth(1.0, [0.0] * 2, [0.0] * 3, [0.0] * 2, [0.0] * 2, [True] * 2, [], 0, 0)
 
 
 def test_rest_without_torque_is_told_from_all_else():

@@ -52,7 +52,7 @@ class World:
         if self.pair.drives is not None and self.pair.drives.alive:
             self.pair.becomes_safe()
         self.pair.nobody_left()
-        self.messages += self.pair.logs_are_whole()
+        self.messages += self.pair.are_whole(self.pair.logs())
         self.start()
 
     def alive(self) -> None:
