@@ -81,10 +81,12 @@ def config_in(folder: Path, source: Path, keys: Mapping[str, str]) -> Path:
 class Child:
     """A process whose output goes to a file."""
 
-    def __init__(self, command: list[str], output: Path) -> None:
+    def __init__(self, command: list[str], output: Path, environment: Mapping[str, str] | None = None) -> None:
         self.output = output
         with output.open("wb") as file:
-            self.popen = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+            self.popen = subprocess.Popen(
+                command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment
+            )
 
     @property
     def text(self) -> str:
@@ -123,6 +125,7 @@ class Pair:
         """`keys`: other values of keys of the robot's file `source`."""
         self.folder, self.config = folder, config_in(folder, source, keys)
         self.pace = [] if realtime else ["--lockstep"]
+        self.environment: Mapping[str, str] | None = None  # of what is started from now on
         self.report = folder / "report.json"
         self.drives: Child | None = None
         self.daemon: Child | None = None
@@ -136,7 +139,9 @@ class Pair:
 
     def _start(self, *command: str) -> Child:
         self._number += 1
-        return Child([sys.executable, "-m", *command, *self.pace], self.folder / f"{self._number}.out")
+        return Child(
+            [sys.executable, "-m", *command, *self.pace], self.folder / f"{self._number}.out", self.environment
+        )
 
     def start_drives(self, *more: str) -> None:
         """Start the drives; `more` of their command line."""
