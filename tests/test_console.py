@@ -571,6 +571,21 @@ def test_a_caller_waits_until_one_of_a_silent_crowd_must_make_room(daemon: Daemo
         link.close()
 
 
+def test_who_calls_when_no_descriptor_is_left_gets_that_of_a_silent_peer(daemon: Daemon) -> None:
+    with daemon.peer(), daemon.peer() as caller:
+        daemon.tick()
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+        try:
+            for _ in range(int(console.IDLE / PERIOD) + 10):
+                daemon.tick()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert daemon.console.counts["idle"] == 1
+        say(caller, {"verb": "stop"})
+        daemon.until(lambda r: r.verb == Verb.STOP)
+
+
 def test_a_peer_that_vanishes_after_its_request_does_no_harm(daemon: Daemon) -> None:
     with daemon.peer() as link:
         say(link, {"verb": "stop"})

@@ -147,7 +147,9 @@ class Console:
     def _accept(self) -> None:
         try:
             link, _ = self._listener.accept()
-        except OSError:
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE) and self._peers:  # who waits gets that of who says nothing
+                self._make_room()
             return
         link.setblocking(False)
         _, uid = trust.peer(link)

@@ -111,7 +111,8 @@ class Recorder:
             return
         command = [sys.executable, "-m", "rtctl.log.record.recorder", str(self._ring.path)]
         try:
-            self._process, self.refusal = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True), ""
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+            self.refusal = ""
         except OSError as error:
             self.refusal = f"{error.strerror or error}".lower()
 
