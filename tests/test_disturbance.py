@@ -9,7 +9,7 @@ import pytest
 from rtctl.arm import faults
 from rtctl.arm.disturbance import BANDWIDTH, LASTING, beyond, carried, observed, rounding, settled, slow_part
 from rtctl.arm.memory import fresh, record_of
-from rtctl.arm.sensing import _stick
+from rtctl.arm.sensing import _stick, _surprise
 from rtctl.kernel.rotations import quat_of
 from tests.lab import ROOT, Lab, lab, robot
 
@@ -106,6 +106,22 @@ def test_a_joint_that_stands_is_not_predicted_to_move_by_what_friction_may_hold(
     m.qd_measured[4] = 0.06
     _stick(arm.arm.constants[0], m, model, qdd)
     np.testing.assert_allclose(qdd, np.array([2.0, -2.0, 0.0, 0.0, 3.0, 0.0, 0.0]) * F / A, atol=1e-9)
+
+
+def test_an_arm_with_an_unknown_load_may_surprise_its_filters_by_what_the_observer_is_behind():
+    """Closed form: LASTING / BANDWIDTH of what does not last yet, within what a payload takes, over A sigma."""
+    arm = robot()
+    model, c = arm.body.evaluate(arm.home, np.zeros(arm.n), arm.points, arm.own), arm.arm.constants[0]
+    m = record_of(fresh())[0]
+    m.external[6], m.lasting[6], m.unsure[6] = 0.5, 0.1, 9.0
+    assert _surprise(c, m, model) == 1.0  # nothing is noticed
+    m.noticed = 1
+    one = model.A[6, 6] * c.joint_sigma_qdd[6]
+    assert _surprise(c, m, model) == pytest.approx(1.0 + 0.4 * LASTING / BANDWIDTH / one)
+    m.unsure[6] = 0.05
+    assert _surprise(c, m, model) == pytest.approx(1.0 + 0.05 / one)
+    m.unsure[6] = 0.0  # the arm is not accelerated: no load explains a surprise
+    assert _surprise(c, m, model) == 1.0
 
 
 # ---- the observer alone

@@ -22,7 +22,7 @@ from rtctl.arm.detection import (
     encoder_flags,
     examine_feedback,
 )
-from rtctl.arm.disturbance import RESTING
+from rtctl.arm.disturbance import BANDWIDTH, LASTING, RESTING
 from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions
 from rtctl.arm.estimator import (
     EstimatorParams,
@@ -214,6 +214,22 @@ def _monitored(c: RecordRow, m: RecordRow, f: Feedback, model: Model) -> tuple[F
 
 
 @kernel
+def _surprise(c: RecordRow, m: RecordRow, model: Model) -> float:
+    """Return by how much more than its noise alone the arm may surprise its filters: 1 where nothing is unknown.
+
+    The observer follows a torque that changes within 1/BANDWIDTH. What is behind is as large as half of what has not
+    come to last yet, and no more than what an unknown payload takes: on a light joint a large acceleration.
+    """
+    if m.floating != 0:
+        return GUIDED_SURPRISE
+    most = 0.0
+    for i in range(model.q.shape[0] if m.noticed != 0 else 0):
+        behind = min(abs(m.external[i] - m.lasting[i]) * LASTING / BANDWIDTH, m.unsure[i])
+        most = max(most, behind / (model.A[i, i] * c.joint_sigma_qdd[i]))
+    return 1.0 + most
+
+
+@kernel
 def detect_faults(
     c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, implausible: bool
 ) -> None:
@@ -249,7 +265,7 @@ def detect_faults(
         m.has_goal != 0,
         m.innovation,
     )
-    k, surprising = m.counters, c.safety_innovation_max * (GUIDED_SURPRISE if m.floating != 0 else 1.0)
+    k, surprising = m.counters, c.safety_innovation_max * _surprise(c, m, model)
     counters = counted(f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]), surprising)
     bounds = Bounds(c.safety_stale_periods, c.safety_lost_periods, c.safety_feed_timeout)
     m.present = detect(f.link, evidence, counters, bounds, c.dt)
