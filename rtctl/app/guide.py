@@ -176,9 +176,8 @@ class Guide:
         led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)
         if led is not None:
             return led
-        if not there and self.plans:
-            return self._planned(m, goal, site)
-        return self._given(self.ends[0]) if self.ends else None
+        planned = self._planned(m, goal, site) if not there and self.plans else None
+        return planned or (self._given(self.ends[0]) if self.ends else None)
 
     def _endings(self, site: Site, goal: Goal) -> list[Ending]:
         """Return postures that have the goal, as far from joint limits as there are any."""
