@@ -8,7 +8,7 @@
 # make mutants small changes of what decides about torque, each of which a test must notice: about an hour
 # make fuzz    every decoder against bytes that others choose: nine minutes
 # make ordeal  100000 random steps with a daemon and its drives, judged from outside: some hours
-# make soak    a rover for a day of its own time: rate, memory and queues; some hours
+# make soak    rover and arm for a day of their own time, and the arm for an hour of ours: memory, queues, logs; a day
 # make docs    the site of documents, into out/site
 # make pictures    every picture of docs anew, and the numbers that their captions name
 # make wheels      the wheel in clean environments of Python 3.11 to 3.13
@@ -61,6 +61,8 @@ ordeal: install
 
 soak: install
 	$(BIN)/python -m tools.soak --minutes 1440
+	$(BIN)/python -m tools.soak --arm --minutes 1440
+	$(BIN)/python -m tools.soak --arm --minutes 60 --realtime
 
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build

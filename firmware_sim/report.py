@@ -72,6 +72,7 @@ class Report:
             "rejected_frames": {n: d.rejected for n, d in zip(names, s.drives, strict=True)},
             "temperature_C": {n: round(d.temperature, 3) for n, d in zip(names, s.drives, strict=True)},
             "q_rad": list(s.plant.q),
+            "tip_m": [float(v) for v in s.plant.tip_pose()[0]],
             "speed_rad_s": [float(v) for v in s.plant.qd],
             "torque_Nm": [float(d.torque) for d in s.drives],
             "brake": [bool(d.brake) for d in s.drives],

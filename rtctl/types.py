@@ -3,7 +3,7 @@
 Shapes: n joints, m points subjected to the potential (PSPs), K obstacle slots.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import STRICT, IntEnum, IntFlag
 from typing import Any, NamedTuple, Protocol, TypeAlias, overload
 
@@ -277,6 +277,9 @@ class Frames(Sequence[bytes]):
         if isinstance(at, int):
             return self.data[at : at + self.size]
         return [self.data[each : each + self.size] for each in at]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(self[:])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)

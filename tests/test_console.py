@@ -539,10 +539,51 @@ def test_a_ninth_peer_is_told_so_while_the_eight_are_busy(daemon: Daemon) -> Non
         daemon.tick()
     with daemon.peer() as ninth:
         daemon.tick()
-        assert "8 peers" in hear(ninth)["error"]
+        told = hear(ninth)
+        assert "8 peers" in told["error"]
+        assert told["room_in_s"] == pytest.approx(console.IDLE, abs=0.1)
         assert ninth.recv(1) == b""
     for link in links:
         link.close()
+
+
+def test_a_caller_waits_until_one_of_a_silent_crowd_must_make_room(daemon: Daemon) -> None:
+    links = [daemon.peer() for _ in range(console.PEERS_MAX)]
+    for _ in links:
+        daemon.tick()
+    asked, over = list[Verb](), threading.Event()
+
+    def serve() -> None:
+        while not over.is_set():
+            request = daemon.tick()
+            asked.append(request.verb)
+            over.wait(0.0005)
+
+    serving = threading.Thread(target=serve)
+    serving.start()
+    try:
+        assert client.ask(daemon.path, {"verb": "stop"}, timeout=60.0)["ok"]
+    finally:
+        over.set()
+        serving.join(60.0)
+    assert Verb.STOP in asked
+    for link in links:
+        link.close()
+
+
+def test_who_calls_when_no_descriptor_is_left_gets_that_of_a_silent_peer(daemon: Daemon) -> None:
+    with daemon.peer(), daemon.peer() as caller:
+        daemon.tick()
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+        try:
+            for _ in range(int(console.IDLE / PERIOD) + 10):
+                daemon.tick()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert daemon.console.counts["idle"] == 1
+        say(caller, {"verb": "stop"})
+        daemon.until(lambda r: r.verb == Verb.STOP)
 
 
 def test_a_peer_that_vanishes_after_its_request_does_no_harm(daemon: Daemon) -> None:

@@ -673,3 +673,181 @@ def test_no_bytes_and_no_motion_make_a_drive_exceed_its_bounds(events: list[tupl
             if state(d) is State.ENABLED and act.torque != 0.0:
                 assert abs(act.torque - last) <= 1.25 + 1e-9 or abs(last) < 1e-12
             last = act.torque
+
+
+# ---- what a drive is after power-on and when it is off, and the edges of its bounds, each by its number
+
+OFF = codec.Command(0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def hot(temperature: float) -> Drive:
+    """Return an enabled drive with a winding of that temperature [degC]."""
+    d = driving()
+    d.temperature = temperature
+    return d
+
+
+def written(d: Drive, number: int, raw: bytes) -> bytes | None:
+    """Write a register and return what the drive says then stands in it."""
+    answer = d.register(struct.pack("<HBB", 3, 0x55, number) + raw)
+    return None if answer is None else answer[4:8]
+
+
+def test_after_power_on_nothing_of_before_is_left() -> None:
+    d = driving()
+    d.trip(Fault.OVERLOAD)
+    d.flags, d.fault_age_ns, d.strength = 7, 9, 0.5
+    d.boot()
+    assert (d.state, int(d.state), d.fault, d.watchdog_tripped, d.brake) == (State.DISABLED, 0, 0, False, True)
+    assert (d.release_ns, d.command, d.torque, d.strength, d.flags) == (-1, OFF, 0.0, 1.0, 0)
+    assert (d.silence_ns, d.fault_age_ns, d.counter_in, d.counter_out) == (0, 0, -1, 0)
+    assert d.slew_budget == d.slew_bound == pytest.approx(1000.0 * 1.25 * 1e-3)
+    assert int(State.FAULT) == 2
+
+
+def test_a_drive_as_its_makers_ship_it() -> None:
+    plain = Rating(3, SCALE, 40.0, 1000.0, 16.0, 1_000_000, 400)
+    assert (plain.baud, plain.e2e, plain.release_ns, plain.reply) == (4, False, 100_000_000, -1)
+    assert Drive(plain).registers[codec.MST_ID] == 0x13
+    assert Drive(plain._replace(reply=0)).registers[codec.MST_ID] == 0
+    new = Drive(plain)
+    assert (new.flash_writes, new.zero, new.q, new.qd, new.rejected) == (0, 0.0, 0.0, 0.0, 0)
+    assert (new.temperature, new.uptime_ns, new.last_valid_ns, new.trips) == (25.0, 0, 0, [])
+
+
+@pytest.mark.parametrize("to", [DISABLE, "trip"])
+def test_a_drive_that_is_off_has_forgotten_its_command(to: bytes | str) -> None:
+    d = driving()
+    if isinstance(to, bytes):
+        d.receive(to)
+    else:
+        d.trip(Fault.OVERLOAD)
+        assert (d.fault, d.fault_age_ns) == (0xE, 0)
+    assert (d.command, d.torque, d.flags, d.release_ns, d.slew_budget) == (OFF, 0.0, 0, -1, d.slew_bound)
+
+
+def test_a_command_that_wants_no_torque_gives_none_and_opens_no_brake() -> None:
+    d = Drive(rating(e2e=True))
+    d.receive(sealed(ENABLE, 1))
+    d.receive(sealed(command(10.0), 2, status=0))
+    run(d, 0.002)
+    assert (d.command, d.release_ns, d.brake, d.torque) == (OFF, -1, True, 0.0)
+    d.receive(sealed(command(10.0), 3))
+    assert d.release_ns == 0
+    run(d, 0.005)
+    d.receive(sealed(command(10.0), 4))
+    assert d.release_ns == 5_000_000  # it goes on from the first
+    d.receive(sealed(command(10.0), 5, status=0))
+    run(d, 0.015)
+    assert d.torque == 0.0
+
+
+def test_a_counter_may_begin_anywhere_and_its_zero_is_a_number_as_others() -> None:
+    for first in (0, 1, 255):
+        d = Drive(rating(e2e=True))
+        d.receive(sealed(ENABLE, first))
+        assert (state(d), d.rejected) == (State.ENABLED, 0)
+        d.receive(sealed(command(1.0), first))
+        assert d.rejected == 1
+
+
+def test_zero_shows_in_the_next_reply() -> None:
+    d = Drive(rating())
+    d.sense(2.0, 0.0)
+    d.receive(ZERO)
+    assert d.q == 0.0
+    d.sense(2.5, 0.0)
+    assert d.q == 0.5
+
+
+@pytest.mark.parametrize(("temperature", "cleared"), [(99.9, True), (100.0, False)])
+def test_a_fault_is_cleared_below_the_temperature_where_derating_begins(temperature: float, cleared: bool) -> None:
+    d = hot(temperature)
+    d.trip(Fault.OVERLOAD)
+    d.watchdog_tripped, d.fault_age_ns = True, 5
+    d.receive(CLEAR)
+    assert (state(d) is State.DISABLED) == cleared
+    if cleared:
+        assert (d.fault, d.watchdog_tripped, d.fault_age_ns) == (0, False, 0)
+
+
+@pytest.mark.parametrize(("temperature", "share"), [(100.0, 1.0), (110.0, 0.75), (119.99, 0.50025)])
+def test_torque_falls_linearly_with_heat_to_half(temperature: float, share: float) -> None:
+    d = hot(temperature)
+    for _ in range(100):
+        d.temperature = temperature
+        d.receive(command(54.0))
+        act = d.actuate(HALF_MS)
+    assert act.torque == pytest.approx(40.0 * share, rel=1e-9)
+    assert bool(d.flags & codec.DERATED) == (share < 1.0)
+
+
+def test_the_power_stage_is_told_half_as_warm() -> None:
+    assert tuple(hot(75.0).reply()[6:]) == (50, 75)
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "taken"),
+    [
+        (codec.PMAX, 0.1, True),  # float32's own is a hair more
+        (codec.PMAX, 0.0999, False),
+        (codec.PMAX, 1000.0, True),
+        (codec.PMAX, 1000.1, False),
+        (codec.TIMEOUT, 0, True),  # as the makers ship it
+        (codec.CTRL_MODE, 1, True),
+        (codec.CTRL_MODE, 0, False),
+        (codec.CTRL_MODE, 2, False),
+    ],
+)
+def test_a_register_takes_what_lies_within_its_bounds(number: int, value: float, taken: bool) -> None:
+    raw = struct.pack("<f", value) if number == codec.PMAX else struct.pack("<I", int(value))
+    d = Drive(rating())
+    d.registers[number] = 3.0
+    assert (written(d, number, raw) == raw) == taken
+
+
+def test_a_wire_value_at_the_very_bound_is_taken() -> None:
+    d = Drive(rating())
+    d._write(codec.PMAX, 0.1)
+    assert d.registers[codec.PMAX] == 0.1
+
+
+def test_a_joint_is_dragged_in_proportion_and_braked_below_its_speed() -> None:
+    for speed, brake in ((0.1005, False), (0.0995, True)):
+        d = driving()
+        d.trip(Fault.OVERLOAD)
+        act = run(d, 0.0005, qd=speed)
+        assert d.brake == brake
+        assert act.torque == 0.0
+        assert act.drag == pytest.approx(60.0 if brake else 40.0)
+    d = driving()
+    d.trip(Fault.OVERLOAD)
+    d.sense(0.0, 0.05)
+    d.brake = False
+    d.actuate(HALF_MS)
+    assert d.trips[-1].rest == -1
+
+
+def test_rest_is_told_once_it_is_slow_enough_and_of_the_last_trip_alone() -> None:
+    d = driving()
+    d.trip(Fault.OVERLOAD)
+    run(d, 0.0005, qd=0.01005)
+    assert d.trips[-1].rest == -1
+    run(d, 0.0005, qd=0.00995)
+    first = d.trips[-1].rest
+    assert first == d.uptime_ns
+    run(d, 0.002)
+    assert d.trips[-1].rest == first
+    d.receive(CLEAR)
+    d.trip(Fault.OVER_VOLTAGE)
+    run(d, 0.0005)
+    assert [trip.rest for trip in d.trips] == [first, d.uptime_ns]
+
+
+@pytest.mark.parametrize(("counts", "trips"), [(0, False), (1, True)])
+def test_a_watchdog_of_one_count_trips_and_of_none_does_not(counts: int, trips: bool) -> None:
+    d = Drive(rating(timeout=counts))
+    d.receive(ENABLE)
+    d.receive(command(1.0))
+    run(d, 0.01)
+    assert (state(d) is State.FAULT) == trips

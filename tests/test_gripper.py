@@ -1,7 +1,9 @@
 """A gripper on the arm's bus, judged by its jaws in the simulator: where they stand and what they press with."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from tests.lab import ROOT, Lab, lab
 
 OPENARM = ROOT / "configs" / "openarm.toml"
 LEVER = 0.09 / 1.05  # [m/rad] of its file
+REPLY = frame.pack(0x18, bytes(8), fd=True, brs=True)[:4]
 
 
 def grip(here: Lab, closed: float, force: float = 0.0, seconds: float = 2.5) -> None:
@@ -85,14 +88,110 @@ def test_it_keeps_what_it_holds_in_a_stop_and_lets_go_with_the_drives():
 def test_a_silent_gripper_is_told_and_the_arm_goes_on():
     with lab(path=OPENARM) as here:
         here.running()
-        reply = frame.pack(0x18, bytes(8), fd=True, brs=True)[:4]
-        heard = here.link.transport._exchange
-        here.link.transport._exchange = lambda frames: [raw for raw in heard(frames) if raw[:4] != reply]
+        unreliable(here, lambda _: 0)
         here.run(0.3)
         assert here.memory.state == State.RUN
         assert not here.memory.in_force
         assert word(here) == "silent"
         assert ("gripper", "gripper: silent at 0.00 of closed") in [e[1:] for e in here.servo.events]
+
+
+@pytest.fixture(scope="module")
+def reversed_jaws(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the OpenArm's file with a gripper whose drive reads less the further it is closed."""
+    text = OPENARM.read_text().replace('"openarm.urdf"', f'"{OPENARM.parent / "openarm.urdf"}"')
+    assert text.count("open_rad = -1.05\nclosed_rad = 0.0") == 1
+    path = tmp_path_factory.mktemp("reversed") / "arm.toml"
+    path.write_text(text.replace("open_rad = -1.05\nclosed_rad = 0.0", "open_rad = 0.3\nclosed_rad = -0.75"))
+    return path
+
+
+def test_jaws_that_close_the_other_way_close_and_open_at_the_speed_of_their_file(reversed_jaws: Path):
+    with lab(path=reversed_jaws) as here:
+        finger = here.simulator.fingers[0]
+        here.running()
+        assert finger.q == pytest.approx(0.3, abs=0.02)
+        here.step(Request(grip=Grip(0.5)))
+        least = 0.0
+        for _ in range(round(2.0 / here.robot.dt)):
+            here.step()
+            least = min(least, finger.qd)
+        assert least == pytest.approx(-0.1 / LEVER, rel=0.1)
+        assert finger.q == pytest.approx(0.3 - 0.525, abs=0.02)
+        assert word(here) == "there"
+        grip(here, 0.0)
+        assert finger.q == pytest.approx(0.3, abs=0.02)
+        assert not here.servo.faults_seen
+
+
+def test_jaws_that_close_the_other_way_press_with_the_force_and_no_more(reversed_jaws: Path):
+    with lab(path=reversed_jaws, scenario={"plant": {"gripper_thing": 0.6}}) as here:
+        finger = here.simulator.fingers[0]
+        here.running()
+        grip(here, 1.0, 20.0)
+        assert finger.pressed / LEVER == pytest.approx(-20.0, abs=0.1 / LEVER + 1.0)
+        assert word(here) == "gripping"
+
+
+def unreliable(here: Lab, passes: Callable[[int], int]) -> None:
+    """Let replies of the gripper come late or never: passes(k) of those that wait after exchange k get through."""
+    heard = here.link.transport._exchange
+    waiting: list[bytes] = []
+    count = iter(range(10**9))
+
+    def exchange(frames: Any) -> list[bytes]:
+        raws = heard(frames)
+        waiting.extend(raw for raw in raws if raw[:4] == REPLY)
+        through = passes(next(count))
+        out, waiting[:] = waiting[:through], waiting[through:]
+        del waiting[4:]
+        return [*(raw for raw in raws if raw[:4] != REPLY), *out]
+
+    here.link.transport._exchange = exchange
+
+
+@pytest.mark.parametrize(
+    "passes",
+    [
+        pytest.param(lambda k: (1, 0, 2, 0, 1)[k % 5], id="lost and late"),
+        pytest.param(lambda k: 4 if k % 20 == 19 else 0, id="in bursts, sixteen periods old"),
+    ],
+)
+def test_replies_that_are_lost_and_late_neither_stop_the_arm_nor_press_harder(passes: Callable[[int], int]):
+    with lab(path=OPENARM, scenario={"plant": {"gripper_thing": 0.6}}) as here:
+        finger = here.simulator.fingers[0]
+        here.running()
+        unreliable(here, passes)
+        grip(here, 1.0, 20.0, seconds=0.1)
+        most = 0.0
+        for _ in range(round(2.5 / here.robot.dt)):
+            here.step()
+            most = max(most, finger.pressed / LEVER)
+            assert word(here) != "silent"
+        assert finger.pressed / LEVER == pytest.approx(20.0, abs=0.1 / LEVER + 1.0)
+        assert most < 20.0 + 25.0  # it comes with its speed
+        assert word(here) == "gripping"
+        assert here.memory.state == State.RUN
+        assert not here.servo.faults_seen
+
+
+def test_a_gripper_that_is_silent_on_its_way_waits_and_goes_on_when_it_is_heard():
+    with lab(path=OPENARM) as here:
+        finger = here.simulator.fingers[0]
+        here.running()
+        grip(here, 1.0, 20.0, seconds=0.3)
+        quiet = [True]
+        unreliable(here, lambda _: 0 if quiet[0] else 9)
+        before = finger.q
+        here.run(0.5)
+        assert word(here) == "silent"
+        gripper = here.robot.grippers[0]
+        assert finger.q < before + 20.0 * LEVER / gripper.kp + 0.02  # no further than the force allows
+        quiet[0] = False
+        here.run(2.0)
+        assert finger.q == pytest.approx(0.0, abs=0.02)
+        assert word(here) == "there"
+        assert here.memory.state == State.RUN
 
 
 def test_feedback_that_knows_of_no_gripper_is_one_of_a_silent_gripper():

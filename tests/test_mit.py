@@ -7,6 +7,7 @@ from typing import Any
 
 import cantools
 import pytest
+from damiao_motor.core.motor import KD_MAX, KP_MAX, MOTOR_TYPE_PRESETS, REGISTER_TABLE
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -163,6 +164,29 @@ def test_register_frames_by_hand() -> None:
     assert mit.write_register(3, mit.TIMEOUT, 400).hex() == "0300550990010000"
     # 12.5 = 0x41480000 as float32
     assert mit.write_register(3, mit.PMAX, 12.5).hex() == "0300551500004841"
+
+
+def test_registers_and_their_names_are_those_of_the_published_driver() -> None:
+    ours = {**mit.REGISTERS, mit.BAUD: "can_br"}  # as it calls the rate
+    assert ours == {number: REGISTER_TABLE[number].variable for number in ours}
+    assert set(ours) == {7, 8, 9, 10, 21, 22, 23, 35}
+    assert {number for number in ours if REGISTER_TABLE[number].data_type == "float"} == mit.FLOATS
+    assert (mit.REGISTER_ID, mit.REPLY_OFFSET, mit.MODE_MIT) == (0x7FF, 0x10, 1)
+    assert "1 register unit = 50 microseconds" in REGISTER_TABLE[mit.TIMEOUT].description
+    assert mit.TIMEOUT_S == 50e-6
+
+
+@pytest.mark.parametrize("name", mit.DRIVES)
+def test_the_spans_of_a_drive_are_those_of_the_published_driver(name: str) -> None:
+    theirs = MOTOR_TYPE_PRESETS[name.removeprefix("DM").replace("_48V", "P")]
+    wanted = mit.Scale(*(theirs[key] for key in ("p_max", "v_max", "t_max")))
+    assert mit.DRIVES[name] == (wanted._replace(v_max=8.0) if name == "DM4340" else wanted)  # the maker's other table
+    assert (mit.KP_MAX, mit.KD_MAX) == (KP_MAX, KD_MAX)
+
+
+def test_a_field_is_rounded_at_its_half() -> None:
+    # 4095 steps of 1: a hair below and above k + 1/2
+    assert [mit.code(2047.5 + hair, 0.0, 4095.0, 12) for hair in (-0.001, 0.001)] == [2047, 2048]
 
 
 @given(st.integers(0, 0x7EF), st.sampled_from(sorted(mit.FLOATS)), st.floats(width=32, allow_nan=False))

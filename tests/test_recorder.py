@@ -182,6 +182,25 @@ while True:
 """
 
 
+def test_a_recorder_that_the_system_refuses_is_told_and_started_once_it_may(start: Start, tmp_path: Path) -> None:
+    recorder = start()
+    put_ticks(recorder, range(100))
+    os.kill(recorder.pid, signal.SIGKILL)
+    wait_for(lambda: not recorder.alive)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))  # no descriptor is left
+    try:
+        recorder.spawn()  # as the loop does once a second: it must go on
+        assert recorder.refusal == "too many open files"
+        assert recorder.stats().degraded
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    recorder.spawn()
+    assert recorder.refusal == ""
+    assert recorder.close().dropped == 0
+    assert logged(tmp_path / "log")[0] == list(range(100))
+
+
 def killed(folder: Path, ticks: int, both: bool) -> tuple[int, int]:
     """Run a producer for some ticks and kill it, and its recorder too if asked; return (recorder's pid, ticks put)."""
     command = [sys.executable, "-c", PRODUCER, str(folder), str(Path(__file__).parent)]

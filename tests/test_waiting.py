@@ -1,5 +1,6 @@
 """Verbs wait for what they cause: for a daemon that starts, a robot that arms, drives that clear their faults."""
 
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from rtctl.app.queue import QUEUED, GoalQueue
 from rtctl.cli import main
 from rtctl.cli.offline import _missed
 from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, LinkError, RequestError
-from rtctl.hal.client import Session, answers
+from rtctl.hal.client import MESSAGE_MAX, Session, answers
 from rtctl.hal.console import Console
 from rtctl.hal.lobby import Lobby
 from rtctl.hal.messages import Bounds, decode, request_of
@@ -115,6 +116,24 @@ def test_a_daemon_that_ends_while_it_starts_is_told_of(place: str, capsys: Said)
         time.sleep(0.3)
     arming.join(60.0)
     assert codes == [EXIT_FAILED]
+    assert "daemon" in capsys.readouterr().err
+
+
+def test_a_daemon_that_ends_in_the_middle_of_an_answer_leaves_no_connection_open(place: str, capsys: Said) -> None:
+    def answer_nobody() -> None:
+        peers = [door.accept()[0] for _ in range(2)]  # who looks whether it lives, and who asks
+        peers[1].recv(MESSAGE_MAX)
+        door.close()
+        for peer in peers:
+            peer.close()
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as door:
+        door.bind(place)
+        door.listen()
+        ending = threading.Thread(target=answer_nobody)
+        ending.start()
+        assert main(["arm", "--socket", place, *PATIENT]) == EXIT_FAILED  # an open socket is an error of the test
+        ending.join(60.0)
     assert "daemon" in capsys.readouterr().err
 
 

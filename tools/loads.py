@@ -2,6 +2,7 @@
 
     python -m tools.loads                  # the loads of tests/test_disturbance.py
     python -m tools.loads openarm_e2e panda
+    python -m tools.loads --write          # and into docs/loads.md
 
 The plant's truth judges: error and angle at the end, the tip's hunting in the last second. The last row of each arm is
 told friction that is not there: too much is given.
@@ -21,6 +22,12 @@ from tests.lab import ROOT, lab
 from tests.test_disturbance import CASES
 from tests.test_friction import told
 
+PAGE = ROOT / "docs" / "loads.md"
+BEGIN, END = "<!-- loads: printed by `python -m tools.loads` -->\n", "<!-- end of loads -->"
+HEAD = (
+    "| arm | load | arrived after [s] | error [mm] | angle [rad] | hunting [mm] | faults |",
+    "|---|---|---|---|---|---|---|",
+)
 PLAYED, LAST = 4.0, 1.0  # [s] in all, and of it the end in which hunting is looked at
 
 
@@ -57,31 +64,48 @@ def arrival(path: Path, name: str, plant: dict[str, Any], payload: float) -> Arr
         )
 
 
+def judged(name: str) -> tuple[list[str], int]:
+    """Return the rows of an arm, as they are printed, and how many of them pass a bound."""
+    case, plain, out, bad = CASES[name], ROOT / "configs" / f"{name}.toml", [], 0
+    both = {"payload_kg": case.payload, "coulomb_Nm": case.coulomb}
+    with tempfile.TemporaryDirectory() as folder:
+        file = told(Path(folder), name)
+        rows = [
+            ("none", arrival(plain, name, {}, 0.0), 1e-3),
+            ("untold", arrival(plain, name, both, 0.0), 3e-3),
+            ("told", arrival(file, name, both, case.payload), 1e-3),
+            ("friction told, none there", arrival(file, name, {"coulomb_Nm": 0.0}, 0.0), 3e-3),
+        ]
+    for label, a, most in rows:
+        late = not a.after < rows[0][1].after + 2.0
+        bad += bool(late or a.error > most or a.angle > 0.01 or a.hunting > 0.5e-3 or a.faults)
+        numbers = f"{a.after:.2f} | {1e3 * a.error:.2f} | {a.angle:.4f} | {1e3 * a.hunting:.3f}"
+        out.append(f"| {name} | {label} | {numbers} | {', '.join(a.faults) or 'none'} |")
+        print(out[-1], flush=True)
+    return out, bad
+
+
+def written(page: str, rows: list[str]) -> str:
+    """Return a page's text with the table between its marks."""
+    head, _, rest = page.partition(BEGIN)
+    _, _, tail = rest.partition(END)
+    return head + BEGIN + "\n" + "\n".join(rows) + "\n\n" + END + tail
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print a table; exit code 1 where a bound is passed."""
     parser = argparse.ArgumentParser(
         prog="tools.loads", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("arms", nargs="*", help=f"of {', '.join(CASES)}; default: all")
-    chosen, bad = parser.parse_args(arguments).arms or list(CASES), 0
-    print("| arm | load | arrived after [s] | error [mm] | angle [rad] | hunting [mm] | faults |")
-    print("|---|---|---|---|---|---|---|")
-    for name in chosen:
-        case, plain = CASES[name], ROOT / "configs" / f"{name}.toml"
-        both = {"payload_kg": case.payload, "coulomb_Nm": case.coulomb}
-        with tempfile.TemporaryDirectory() as folder:
-            file = told(Path(folder), name)
-            rows = [
-                ("none", arrival(plain, name, {}, 0.0), 1e-3),
-                ("untold", arrival(plain, name, both, 0.0), 3e-3),
-                ("told", arrival(file, name, both, case.payload), 1e-3),
-                ("friction told, none there", arrival(file, name, {"coulomb_Nm": 0.0}, 0.0), 3e-3),
-            ]
-        for label, a, most in rows:
-            late = not a.after < rows[0][1].after + 2.0
-            bad += bool(late or a.error > most or a.angle > 0.01 or a.hunting > 0.5e-3 or a.faults)
-            numbers = f"{a.after:.2f} | {1e3 * a.error:.2f} | {a.angle:.4f} | {1e3 * a.hunting:.3f}"
-            print(f"| {name} | {label} | {numbers} | {', '.join(a.faults) or 'none'} |", flush=True)
+    parser.add_argument("--write", action="store_true", help="put the table into docs/loads.md")
+    asked, bad, rows = parser.parse_args(arguments), 0, list(HEAD)
+    print("\n".join(HEAD))
+    for name in asked.arms or list(CASES):
+        more, beyond = judged(name)
+        rows, bad = rows + more, bad + beyond
+    if asked.write:
+        PAGE.write_text(written(PAGE.read_text(encoding="utf-8"), rows), encoding="utf-8")
     return int(bad > 0)
 
 

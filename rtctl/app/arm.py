@@ -96,8 +96,8 @@ def events(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         found.append(("state", after.state.name))
     if after.own_phase:
         found += unheld(robot, before, after, feedback)
-    if not np.array_equal(after.payload, before.payload):
-        mass, x, y, z = after.payload
+    if (payload := after.payload.tolist()) != before.payload.tolist():
+        mass, x, y, z = payload
         found.append(("payload", f"{mass:g} kg at {x:g} {y:g} {z:g} m of the tip" if mass > 0.0 else "none"))
     if before.floating and not after.floating:
         found.append(("hold", "no hand guides the arm any more"))

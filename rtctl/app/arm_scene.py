@@ -1,5 +1,6 @@
 """A scenario played to a simulated arm: what the controller is told and when, and the figures of what came of it."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -48,8 +49,10 @@ class ArmTally:
         self.tip: F64 | None = None
         self.tau: F64 | None = None
         self.path = self.speed = 0.0
-        self.torque = self.rate = self.joint_speed = 0.0
-        self.margin = self.own = np.inf
+        zero = np.zeros(robot.n)
+        self.torque, self.step, self.joint_speed = zero.copy(), zero.copy(), zero.copy()  # largest of each joint
+        self.lowest, self.highest = zero + np.inf, zero - np.inf  # [rad]
+        self.own = np.inf
         self.clearance: dict[str, float] = {}
         self.contacts = 0
         self.offset = 0.0  # [s] scenario time less the servo's
@@ -59,16 +62,17 @@ class ArmTally:
         robot = self.robot
         self.offset = truth.time - (turn.feedback.slot + 1) * robot.dt
         if self.tip is not None:
-            step = float(np.linalg.norm(truth.tip - self.tip))
+            step = math.dist(truth.tip, self.tip)
             self.path, self.speed = self.path + step, max(self.speed, step / robot.dt)
         self.tip = truth.tip.copy()
         driven = turn.command.drive == Drive.TORQUE
         if driven and self.tau is not None:
-            self.rate = max(self.rate, float((np.abs(turn.command.tau - self.tau) / (robot.tau_rate * robot.dt)).max()))
+            np.maximum(self.step, np.abs(turn.command.tau - self.tau), out=self.step)
         self.tau = turn.command.tau if driven else None
-        self.torque = max(self.torque, float((np.abs(turn.command.tau) / robot.tau_rated).max()))
-        self.joint_speed = max(self.joint_speed, float((np.abs(truth.qd) / robot.qd_max).max()))
-        self.margin = min(self.margin, float(np.minimum(truth.q - robot.q_min, robot.q_max - truth.q).min()))
+        np.maximum(self.torque, np.abs(turn.command.tau), out=self.torque)
+        np.maximum(self.joint_speed, np.abs(truth.qd), out=self.joint_speed)
+        np.minimum(self.lowest, truth.q, out=self.lowest)
+        np.maximum(self.highest, truth.q, out=self.highest)
         self.own, self.contacts = min(self.own, truth.self_clearance), truth.contacts
         for name, d in truth.clearance.items():
             self.clearance[name] = min(d, self.clearance.get(name, np.inf))
@@ -77,13 +81,15 @@ class ArmTally:
 
     def figures(self) -> Json:
         """Return the figures under their published names."""
+        robot = self.robot
+        margin = np.minimum(self.lowest - robot.q_min, robot.q_max - self.highest)
         return {
             **of_way(self.legs, self.path, self.speed, self.clearance, self.contacts, turned=True),
             "min_self_clearance_m": number(self.own),
-            "min_joint_margin_rad": number(self.margin),
-            "max_torque_ratio": number(self.torque),
-            "max_torque_rate_ratio": number(self.rate),
-            "max_joint_speed_ratio": number(self.joint_speed),
+            "min_joint_margin_rad": number(float(margin.min())),
+            "max_torque_ratio": number(float((self.torque / robot.tau_rated).max())),
+            "max_torque_rate_ratio": number(float((self.step / (robot.tau_rate * robot.dt)).max())),
+            "max_joint_speed_ratio": number(float((self.joint_speed / robot.qd_max).max())),
         }
 
 

@@ -1,5 +1,6 @@
 """What a simulated run reports of its goals, the way and the clearances: the same for an arm and a base."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -27,11 +28,11 @@ class Leg(NamedTuple):
 
         along: [m] from the start to the goal; offset: [m] from the start to where it is now [s].
         """
-        length = float(np.linalg.norm(along))
+        length = math.hypot(*along.tolist())
         if length > 1e-9:
             offset = offset - along * min(max(float(offset @ along) / length**2, 0.0), 1.0)
         reached = (self.reached if self.reached >= 0.0 else now) if there else -1.0
-        deviation = max(self.deviation, float(np.linalg.norm(offset)))
+        deviation = max(self.deviation, math.hypot(*offset.tolist()))
         return self._replace(reached=reached, deviation=deviation, error=error, error_rot=error_rot)
 
 

@@ -20,7 +20,7 @@ from rtctl.errors import RtctlError
 from rtctl.kernel.cache import folder
 from rtctl.spec.base import is_base
 
-POLL = 0.1  # [s]
+POLL = 0.25  # [s] between two looks at what was compiled: a look takes time from the compilers
 KEPT = 50  # marks of what was warmed
 _ROOT = Path(__file__).resolve().parents[1]
 _KERNEL = re.compile(rb"^@(?:ieee_)?kernel\b", re.MULTILINE)
@@ -78,11 +78,25 @@ def _mark(config: Path) -> Path:
 def _made(since: float) -> int:
     """Return how many kernels were written to the caches since a time [s]."""
     count = 0
-    with suppress(OSError):  # another process may clear old caches away meanwhile
-        for path in folder().glob("rtctl.*/*/*.nbi"):
-            with suppress(OSError):
-                count += path.stat().st_mtime >= since
+    for module in _entries(folder()):
+        for version in _entries(module.path) if module.name.startswith("rtctl.") else ():
+            if _written(version) >= since:  # few are, of what may be hundreds
+                count += sum(e.name.endswith(".nbi") and _written(e) >= since for e in _entries(version.path))
     return count
+
+
+def _entries(path: str | Path) -> list[os.DirEntry[str]]:
+    """Return what is in a folder, nothing where another process has cleared it away meanwhile."""
+    with suppress(OSError), os.scandir(path) as entries:
+        return list(entries)
+    return []
+
+
+def _written(entry: os.DirEntry[str]) -> float:
+    """Return when a file or a folder was last written to [s], 0 where it is gone."""
+    with suppress(OSError):
+        return entry.stat().st_mtime
+    return 0.0
 
 
 def _robot(config: Path) -> None:

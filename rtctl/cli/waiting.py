@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from contextlib import ExitStack
 from typing import NamedTuple
 
 from rtctl.cli.parser import daemon_of
@@ -63,11 +64,12 @@ def ready_session(arguments: argparse.Namespace, verb: str, patience: float = PA
     while not answers(path) and time.monotonic() - begun < patience:  # named by --socket, and not there yet
         time.sleep(POLL)
     while True:
-        session = Session(path, arguments.reply)
-        doing = _doing(session)
-        if not doing:
-            return session
-        session.close()
+        with ExitStack() as stack:
+            session = stack.enter_context(Session(path, arguments.reply))
+            doing = _doing(session)
+            if not doing:
+                stack.pop_all()  # open for the caller
+                return session
         if time.monotonic() - begun > START_TIME:
             raise LinkError(f"{path}: the daemon is not ready after {START_TIME:g} s: {doing}")
         notes.say(f"waiting for the daemon, which starts: {doing}", doing.split(",")[0])

@@ -112,9 +112,23 @@ class Session:
         return self.ask_raw(data)
 
     def ask_raw(self, data: bytes) -> Json:
-        """Return the daemon's reply to a message that is bytes already, as a cloud's is; raises as `ask`."""
+        """Return the daemon's reply to a message that is bytes already, as a cloud's is; raises as `ask`.
+
+        A daemon with too many callers says when one of them must make room: that is waited for, within the timeout.
+        """
         if len(data) > MESSAGE_MAX:
             raise RequestError(f"a request of {len(data)} bytes, at most {MESSAGE_MAX} are taken")
+        until = time.monotonic() + self.timeout
+        while True:
+            reply = self._reply(data)
+            wait = reply.get("room_in_s")
+            if not isinstance(wait, float) or time.monotonic() + wait >= until:
+                return reply
+            self.close()
+            time.sleep(max(wait, RETRY))
+            self._socket = _connect(self.path, self.timeout)
+
+    def _reply(self, data: bytes) -> Json:
         try:
             raw = self._exchange(data)
         except TimeoutError:

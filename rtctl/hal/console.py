@@ -147,7 +147,9 @@ class Console:
     def _accept(self) -> None:
         try:
             link, _ = self._listener.accept()
-        except OSError:
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE) and self._peers:  # who waits gets that of who says nothing
+                self._make_room()
             return
         link.setblocking(False)
         _, uid = trust.peer(link)
@@ -155,21 +157,24 @@ class Console:
             self.counts["foreign_user"] += 1
             link.close()
             return
-        if len(self._peers) >= PEERS_MAX and not self._make_room():
+        if len(self._peers) >= PEERS_MAX and (wait := self._make_room()) > 0.0:
             self.counts["too_many"] += 1
-            self._send(link, {"ok": False, "error": f"{PEERS_MAX} peers are connected already"})
+            self._send(link, {"ok": False, "error": f"{PEERS_MAX} peers are connected already", "room_in_s": wait})
             link.close()
             return
         self._peers[link.fileno()] = _Peer(link, self._slot)
         self._epoll.register(link, select.EPOLLIN)
 
-    def _make_room(self) -> bool:
-        """Drop the peer that has been silent longest, if long enough: a forgotten terminal must not keep `stop` out."""
+    def _make_room(self) -> float:
+        """Drop the peer that has been silent longest, if long enough: a forgotten terminal must not keep `stop` out.
+
+        Return how long [s] it may yet be silent before it must go, 0 when it went.
+        """
         peer = min(self._peers.values(), key=lambda peer: peer.slot)
-        if (self._slot - peer.slot) * self._period < IDLE:
-            return False
-        self._drop(peer, "idle")
-        return True
+        left = IDLE - (self._slot - peer.slot) * self._period
+        if left <= 0.0:
+            self._drop(peer, "idle")
+        return max(left, 0.0)
 
     def _read(self, peer: _Peer) -> None:
         peer.slot = self._slot

@@ -10,6 +10,7 @@ descriptors than it closes; no torque in IDLE or FAULT. Exit status 0 when all o
 
 import argparse
 import random
+import subprocess
 import sys
 import tempfile
 import time
@@ -18,6 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from tools.ordeal.clock import WallClock
 from tools.ordeal.pair import Failed, Pair
 from tools.ordeal.steps import HEAVY, STEPS, World, look, terminate
 
@@ -42,7 +44,9 @@ def ordeal(
     pair = Pair(folder)
     world, failure = None, ""
     try:
-        world = World(pair, rng)
+        clock = _clock(folder, say)
+        pair.environment = clock.environment if clock else None
+        world = World(pair, rng, clock)
         for k in range(steps):
             step = rng.choices(list(STEPS), weights)[0]
             done[step.__name__] += 1
@@ -58,6 +62,14 @@ def ordeal(
     finally:
         pair.end()
     return Account(done, world.lives if world else 0, world.messages if world else 0, failure)
+
+
+def _clock(folder: Path, say: Callable[[str], None]) -> WallClock | None:
+    try:
+        return WallClock(folder)
+    except (OSError, subprocess.CalledProcessError) as error:
+        say(f"the wall clock is not set: {error}")
+        return None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ from rtctl.hal.client import Session
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "configs" / "panda.toml"
+QUICK = {"self_collision": "false", "segment_s": "10.0", "disk_floor_MB": "1.0"}
 PATIENCE = 300.0  # [s] for what must happen; what never does fails, what is slow does not
 COMPILING = 3000.0  # [s]
 ASK = 120.0  # [s] for an answer
@@ -41,10 +42,12 @@ class Truth(NamedTuple):
 
     time: float  # [s] of theirs
     q: list[float]  # [rad]
+    tip: list[float]  # [m]
     speed: list[float]  # [rad/s]
     torque: list[float]  # [Nm]
     brake: list[bool]
     trips: list[dict[str, Any]]
+    contacts: int
     written: int  # [ns] when
 
     @property
@@ -62,12 +65,12 @@ def wait_for(true: Callable[[], object], what: Callable[[], str], patience: floa
         time.sleep(0.01)
 
 
-def config_in(folder: Path) -> Path:
-    """Write the robot's file with a bus, a console and logs of its own; return its path."""
+def config_in(folder: Path, source: Path, keys: Mapping[str, str]) -> Path:
+    """Write the robot's file with a bus, a console and logs of its own, and other values of keys; return its path."""
     (folder / "run").mkdir(mode=0o700, exist_ok=True)
-    text = SOURCE.read_text(encoding="utf-8")
-    changes = {"channel": f'"{folder}/bus"', "self_collision": "false", "directory": f'"{folder}/logs"'}
-    for key, value in {**changes, "segment_s": "10.0", "disk_floor_MB": "1.0"}.items():
+    text = source.read_text(encoding="utf-8")
+    own = {"channel": f'"{folder}/bus"', "directory": f'"{folder}/logs"'}
+    for key, value in {**own, **keys}.items():
         text, count = re.subn(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
         assert count == 1, key
     path = folder / "ordeal.toml"
@@ -78,10 +81,12 @@ def config_in(folder: Path) -> Path:
 class Child:
     """A process whose output goes to a file."""
 
-    def __init__(self, command: list[str], output: Path) -> None:
+    def __init__(self, command: list[str], output: Path, environment: Mapping[str, str] | None = None) -> None:
         self.output = output
         with output.open("wb") as file:
-            self.popen = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+            self.popen = subprocess.Popen(
+                command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment
+            )
 
     @property
     def text(self) -> str:
@@ -112,10 +117,15 @@ class Child:
 
 
 class Pair:
-    """A daemon and its drives in lockstep."""
+    """A daemon and its drives, in lockstep unless told otherwise."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.config = folder, config_in(folder)
+    def __init__(
+        self, folder: Path, source: Path = SOURCE, keys: Mapping[str, str] = QUICK, realtime: bool = False
+    ) -> None:
+        """`keys`: other values of keys of the robot's file `source`."""
+        self.folder, self.config = folder, config_in(folder, source, keys)
+        self.pace = [] if realtime else ["--lockstep"]
+        self.environment: Mapping[str, str] | None = None  # of what is started from now on
         self.report = folder / "report.json"
         self.drives: Child | None = None
         self.daemon: Child | None = None
@@ -129,12 +139,14 @@ class Pair:
 
     def _start(self, *command: str) -> Child:
         self._number += 1
-        return Child([sys.executable, "-m", *command, "--lockstep"], self.folder / f"{self._number}.out")
+        return Child(
+            [sys.executable, "-m", *command, *self.pace], self.folder / f"{self._number}.out", self.environment
+        )
 
-    def start_drives(self) -> None:
-        """Start the drives."""
+    def start_drives(self, *more: str) -> None:
+        """Start the drives; `more` of their command line."""
         self.report.unlink(missing_ok=True)
-        self.drives = self._start("firmware_sim", str(self.config), "--report", str(self.report))
+        self.drives = self._start("firmware_sim", str(self.config), "--report", str(self.report), *more)
         self.drives.said("drives ready")
 
     def start_daemon(self) -> None:
@@ -190,7 +202,8 @@ class Pair:
         except FileNotFoundError:
             return None
         speed, torque, brake = told["speed_rad_s"], told["torque_Nm"], told["brake"]
-        return Truth(told["time_s"], told["q_rad"], speed, torque, brake, told["trips"], written)
+        at, touched = (told["q_rad"], told["tip_m"]), told["contacts"]
+        return Truth(told["time_s"], *at, speed, torque, brake, told["trips"], touched, written)
 
     def later(self) -> Truth:
         """Return an account that was written after now, twice: the first may have been under way."""
@@ -229,10 +242,14 @@ class Pair:
         wait_for(lambda: not any(map(_lives, self.born)), lambda: f"left: {sorted(filter(_lives, self.born))}")
         self.born.clear()
 
-    def logs_are_whole(self) -> int:
-        """Read the logs that were not read before with mcap's own reader; return how many messages. Raises Failed."""
+    def logs(self) -> list[Path]:
+        """Return the files of the log, oldest first."""
+        return sorted((self.folder / "logs").glob("*.mcap"))
+
+    def are_whole(self, logs: Sequence[Path]) -> int:
+        """Read what of the logs was not read before with mcap's own reader; return how many messages. Raises Failed."""
         count = 0
-        for path in sorted((self.folder / "logs").glob("*.mcap")):
+        for path in logs:
             if path in self.read:
                 continue
             self.read.add(path)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from tools.ordeal.clock import WallClock
 from tools.ordeal.pair import NO_LIMIT, Failed, Pair, break_sockets, descriptors
 
 LEGAL_ENDS = (0, 1)  # a daemon that may end does so with these
@@ -19,8 +20,8 @@ SPARE_DESCRIPTORS = 12  # that a daemon may have more than at its start: callers
 class World:
     """A pair, chance, and what the steps remember."""
 
-    def __init__(self, pair: Pair, rng: random.Random) -> None:
-        self.pair, self.rng = pair, rng
+    def __init__(self, pair: Pair, rng: random.Random, clock: WallClock | None = None) -> None:
+        self.pair, self.rng, self.clock = pair, rng, clock
         self.messages = 0  # of logs that were read
         self.lives = 0
         self.open_at_start = 0
@@ -52,7 +53,7 @@ class World:
         if self.pair.drives is not None and self.pair.drives.alive:
             self.pair.becomes_safe()
         self.pair.nobody_left()
-        self.messages += self.pair.logs_are_whole()
+        self.messages += self.pair.are_whole(self.pair.logs())
         self.start()
 
     def alive(self) -> None:
@@ -221,6 +222,12 @@ def breaks(w: World) -> None:
     w.ended()
 
 
+def set_clock(w: World) -> None:
+    """Somebody sets the wall clock: a little, by a summer time, to 1970, by years; nothing is ordered by it."""
+    if w.clock is not None:
+        w.clock.set(w.rng.choice((0, -2, 2, -3600, 3600, -int(time.time()), -600_000_000, 600_000_000)))
+
+
 STEPS: dict[Callable[[World], None], float] = {
     verb: 30.0,
     goal: 20.0,
@@ -234,6 +241,7 @@ STEPS: dict[Callable[[World], None], float] = {
     pause_recorder: 0.5,
     disk: 0.2,
     few_descriptors: 0.2,
+    set_clock: 0.5,
     kill_recorder: 0.05,
     kill_daemon: 0.05,
     terminate: 0.05,

@@ -61,6 +61,7 @@ class Recorder:
         self._ring = ring
         self._options = options
         self._process: subprocess.Popen[bytes] | None = None
+        self.refusal = ""  # why it could not be started, the last time that was tried
         self._drops = DropWatch()
         self.put = ring.put
         self.put_many = ring.put_many
@@ -96,15 +97,24 @@ class Recorder:
         while not ring.counts().ready:
             if not recorder.alive or time.monotonic() > until:
                 recorder._abandon()
-                raise LogError(f"{directory}: the recorder did not start")
+                raise LogError(f"{directory}: the recorder did not start{recorder.refusal and ': '}{recorder.refusal}")
             time.sleep(0.01)
         return recorder
 
     def spawn(self) -> None:
-        """Start the recorder process on the ring; also after it died, which loses nothing. Takes some milliseconds."""
-        if not self.alive:
-            command = [sys.executable, "-m", "rtctl.log.record.recorder", str(self._ring.path)]
+        """Start the recorder process on the ring; also after it died, which loses nothing. Takes some milliseconds.
+
+        A system that has no descriptor, process or memory left refuses it: then the log stays degraded until it is
+        tried again, and the loop goes on.
+        """
+        if self.alive:
+            return
+        command = [sys.executable, "-m", "rtctl.log.record.recorder", str(self._ring.path)]
+        try:
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+            self.refusal = ""
+        except OSError as error:
+            self.refusal = f"{error.strerror or error}".lower()
 
     @property
     def alive(self) -> bool:

@@ -1,17 +1,7 @@
-"""A soak of the rover: rate, memory and queues over a long run, in lockstep (accelerated) or in real time.
+"""A rover on a long way: to and fro between two goals around a disc, in this process."""
 
-    python -m tools.soak                       20 minutes of 50 Hz set-points in lockstep, a few minutes of this machine
-    python -m tools.soak --realtime --minutes 20
-
-It drives to and fro between two goals around a disc. Exit status 0 when no tick, set-point or goal was missed, nothing
-was touched, and neither memory nor any queue of the link grew from the second quarter of the run to its last.
-"""
-
-import argparse
 import gc
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,12 +14,13 @@ from rtctl.app.servo import Servo
 from rtctl.design.rover import build
 from rtctl.hal.clock import Slot
 from rtctl.hal.mavlink.wire import InProcess
+from rtctl.rover.faults import names
 from rtctl.spec.base import load
 from rtctl.types import Goal, Request, State, Status, Task, Verb
+from tools.soak.growth import GROWTH, quarters, resident
 
 DISC = {"name": "disc", "type": "cylinder", "radius_m": 1.0, "length_m": 2.0, "position_m": [8.0, 0.0, 0.0]}
 GOALS = ((16.0, 0.0), (0.0, 0.0))
-GROWTH = 1.5  # [MB] that the process may differ by between the second quarter and the last
 STEP = 60.0  # [s] between lines
 
 
@@ -42,30 +33,6 @@ class Sample(NamedTuple):
     queue: int  # things that wait anywhere in the link
     goals: int
     compute: float  # [ms] p99 of a turn
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.soak", description="Rate, memory and queues over a long run."
-    )
-    parser.add_argument("--config", default="configs/rover.toml", help="robot file (%(default)s)")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of robot time (%(default)s)")
-    parser.add_argument("--realtime", action="store_true", help="no faster than the clock")
-    args = parser.parse_args(argv)
-    samples, contacts, faults = soak(Path(args.config), args.minutes, args.realtime)
-    quarter = max(1, len(samples) // 4)
-    before = np.mean([s.memory for s in samples[quarter : 2 * quarter] or samples])
-    after = np.mean([s.memory for s in samples[-quarter:]])
-    rates = [s.setpoints for s in samples]
-    queue = max(s.queue for s in samples)
-    print(
-        f"set-points {min(rates):.2f} to {max(rates):.2f} Hz, memory {before:.1f} then {after:.1f} MB, "
-        f"at most {queue} waiting, {sum(s.goals for s in samples)} goals, {contacts} contacts, "
-        f"faults: {', '.join(faults) or 'none'}"
-    )
-    steady = max(rates) - min(rates) < 0.05 and abs(after - before) < GROWTH and queue < 40
-    return 0 if steady and not contacts and not faults else 1
 
 
 def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample], int, list[str]]:
@@ -98,7 +65,7 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
             waiting = len(link.events) + len(link.view.asked) + len(link.talk._waiting) + len(rover.autopilot.outbox)
             minute = len(samples) + 1
             samples.append(
-                Sample(minute, sent / STEP, _resident(), waiting, goals - done, 1e3 * float(np.percentile(times, 99)))
+                Sample(minute, sent / STEP, resident(), waiting, goals - done, 1e3 * float(np.percentile(times, 99)))
             )
             s = samples[-1]
             told = f"{s.setpoints:6.2f} Hz  {s.memory:7.1f} MB  {s.queue:3d} waiting  {s.goals:2d} goals"
@@ -106,15 +73,17 @@ def soak(config_file: Path, minutes: float, realtime: bool) -> tuple[list[Sample
             sent, times = 0, []
         if realtime:
             time.sleep(max(0.0, begun + (slot + 1) * base.dt - time.monotonic()))
-    from rtctl.rover.faults import names
-
     return samples[1:] if len(samples) > 2 else samples, rover.truth().contacts, list(names(servo.faults_seen))
 
 
-def _resident() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * 4096 / 1e6
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def judged(samples: list[Sample], contacts: int, faults: list[str]) -> bool:
+    """Print what a run came to; return whether nothing was missed, touched or grew."""
+    before, after = quarters([s.memory for s in samples])
+    rates, queue = [s.setpoints for s in samples], max(s.queue for s in samples)
+    print(
+        f"set-points {min(rates):.2f} to {max(rates):.2f} Hz, memory {before:.1f} then {after:.1f} MB, "
+        f"at most {queue} waiting, {sum(s.goals for s in samples)} goals, {contacts} contacts, "
+        f"faults: {', '.join(faults) or 'none'}"
+    )
+    steady = max(rates) - min(rates) < 0.05 and abs(after - before) < GROWTH and queue < 40
+    return steady and not contacts and not faults

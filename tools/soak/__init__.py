@@ -1,0 +1,1 @@
+"""Long runs: rate, memory, descriptors, segments, queues; see `__main__`."""
