@@ -1,6 +1,8 @@
 """The error tree: start-up and user mistakes only; run-time faults are values, not exceptions."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 
 EXIT_OK = 0
@@ -98,3 +100,15 @@ def needs(extra: str, *modules: str) -> None:
         raise UsageError(
             f"this needs rtctl[{extra}]: pip install 'rtctl[{extra}]' ({', '.join(lacking)} not installed)"
         )
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Leave the block on Ctrl-C without a word; where compiled code ran it comes as the cause of a SystemError."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    except SystemError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise

@@ -21,7 +21,7 @@ import pytest
 from rtctl.arm.record import record_dtype
 from rtctl.arm.task import names
 from rtctl.cli import build_parser, main, values
-from rtctl.errors import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, EXIT_USAGE, UsageError
+from rtctl.errors import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, EXIT_USAGE, UsageError, until_interrupted
 from rtctl.hal import doctor
 from rtctl.hal.console import Console
 from rtctl.hal.messages import Bounds
@@ -223,6 +223,13 @@ def test_an_interrupt_is_quiet(arm: Arm) -> None:
     assert out == b""
     assert b"Traceback" not in err
     assert process.returncode == EXIT_FAILED
+
+
+def test_an_interrupt_while_compiled_code_runs_is_one_too() -> None:
+    with until_interrupted():  # as the interpreter tells it, that finds it beside a result
+        raise SystemError("servo returned a result with an exception set") from KeyboardInterrupt()
+    with pytest.raises(SystemError), until_interrupted():
+        raise SystemError("another")
 
 
 def test_the_version_is_that_of_the_package() -> None:

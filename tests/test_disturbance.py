@@ -8,8 +8,10 @@ import pytest
 
 from rtctl.arm import faults
 from rtctl.arm.disturbance import BANDWIDTH, LASTING, beyond, carried, observed, rounding, settled, slow_part
+from rtctl.arm.memory import fresh, record_of
+from rtctl.arm.sensing import _stick
 from rtctl.kernel.rotations import quat_of
-from tests.lab import ROOT, Lab, lab
+from tests.lab import ROOT, Lab, lab, robot
 
 
 class Case(NamedTuple):
@@ -69,6 +71,41 @@ def test_what_nobody_told_of_is_carried_to_the_goal(name: str):
         assert 2.0 * np.arccos(min(abs(truth.tip_wxyz @ quat_of(R)), 1.0)) < 1e-2
         assert faults.names(here.servo.faults_seen) == ()
         assert {name for _, name, _ in here.servo.events} <= {"state", "moving", "arrived"}
+
+
+def test_a_light_joint_that_sticks_under_a_payload_has_no_stuck_encoder():
+    """The wrist stands by its friction while the payload, its centre beside the tip, is accelerated by other joints."""
+    plant = {
+        "payload_kg": 1.535,
+        "payload_com_m": [0.045, -0.036, 0.045],
+        "coulomb_Nm": [1.36, 1.84, 3.6, 1.78, 0.33, 0.017, 0.45],
+    }
+    with lab(scenario={"plant": plant}) as here:
+        here.running()
+        until(here, lambda _: here.simulator.time >= 0.5, 1.0)
+        here.ask([0.50, 0.35, 0.40], quat_of(here.memory.tip.R))
+        stood = 0.0
+        for _ in range(round(0.8 / here.robot.dt)):
+            here.step()
+            truth = here.simulator.truth()
+            stood += here.robot.dt * (abs(truth.qd[4]) < 1e-3 < 0.1 < abs(truth.qd[0]))
+        assert stood > 0.05
+        assert faults.names(here.servo.faults_seen) == ()
+
+
+def test_a_joint_that_stands_is_not_predicted_to_move_by_what_friction_may_hold():
+    """Closed form: friction takes F / A of the acceleration, all of a lesser one, nothing of a joint that moves."""
+    arm, F = robot(), robot().friction_max
+    model = arm.body.evaluate(arm.home, np.zeros(arm.n), arm.points, arm.own)
+    A, m = model.A.diagonal(), record_of(fresh())[0]
+    asked = np.array([3.0, -3.0, 0.5, -0.5, 3.0, -1.0, 1.0]) * F / A
+    qdd = asked.copy()
+    _stick(arm.arm.constants[0], m, model, qdd)
+    np.testing.assert_array_equal(qdd, asked)  # nothing is noticed that friction could explain
+    m.noticed = 1
+    m.qd_measured[4] = 0.06
+    _stick(arm.arm.constants[0], m, model, qdd)
+    np.testing.assert_allclose(qdd, np.array([2.0, -2.0, 0.0, 0.0, 3.0, 0.0, 0.0]) * F / A, atol=1e-9)
 
 
 # ---- the observer alone

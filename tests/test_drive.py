@@ -695,8 +695,8 @@ def written(d: Drive, number: int, raw: bytes) -> bytes | None:
 
 def test_after_power_on_nothing_of_before_is_left() -> None:
     d = driving()
-    d.trip(Fault.OVERLOAD)
-    d.flags, d.fault_age_ns, d.strength = 7, 9, 0.5
+    d.state, d.fault, d.watchdog_tripped, d.brake = State.FAULT, 0xE, True, False
+    d.flags, d.fault_age_ns, d.strength, d.slew_budget = 7, 9, 0.5, 0.0
     d.boot()
     assert (d.state, int(d.state), d.fault, d.watchdog_tripped, d.brake) == (State.DISABLED, 0, 0, False, True)
     assert (d.release_ns, d.command, d.torque, d.strength, d.flags) == (-1, OFF, 0.0, 1.0, 0)
@@ -784,6 +784,7 @@ def test_torque_falls_linearly_with_heat_to_half(temperature: float, share: floa
 
 def test_the_power_stage_is_told_half_as_warm() -> None:
     assert tuple(hot(75.0).reply()[6:]) == (50, 75)
+    assert tuple(hot(120.8).reply()[6:]) == (72, 120)  # 72.9, cut off
 
 
 @pytest.mark.parametrize(
@@ -813,13 +814,14 @@ def test_a_wire_value_at_the_very_bound_is_taken() -> None:
 
 
 def test_a_joint_is_dragged_in_proportion_and_braked_below_its_speed() -> None:
-    for speed, brake in ((0.1005, False), (0.0995, True)):
+    for speed, brake in ((0.1005, False), (0.1, False), (0.0995, True)):
         d = driving()
         d.trip(Fault.OVERLOAD)
         act = run(d, 0.0005, qd=speed)
         assert d.brake == brake
         assert act.torque == 0.0
         assert act.drag == pytest.approx(60.0 if brake else 40.0)
+        assert d.torque == (0.0 if brake else -40.0)  # as the reply tells
     d = driving()
     d.trip(Fault.OVERLOAD)
     d.sense(0.0, 0.05)
@@ -831,8 +833,9 @@ def test_a_joint_is_dragged_in_proportion_and_braked_below_its_speed() -> None:
 def test_rest_is_told_once_it_is_slow_enough_and_of_the_last_trip_alone() -> None:
     d = driving()
     d.trip(Fault.OVERLOAD)
-    run(d, 0.0005, qd=0.01005)
-    assert d.trips[-1].rest == -1
+    for speed in (0.01005, 0.01):
+        run(d, 0.0005, qd=speed)
+        assert d.trips[-1].rest == -1
     run(d, 0.0005, qd=0.00995)
     first = d.trips[-1].rest
     assert first == d.uptime_ns
@@ -851,3 +854,47 @@ def test_a_watchdog_of_one_count_trips_and_of_none_does_not(counts: int, trips: 
     d.receive(command(1.0))
     run(d, 0.01)
     assert (state(d) is State.FAULT) == trips
+
+
+def test_a_brake_closes_at_its_latest_instant() -> None:
+    d = driving()
+    d.trip(Fault.OVERLOAD)
+    d.fault_age_ns = 1_000_000_000
+    d.sense(0.0, 5.0)
+    d.actuate(HALF_MS)
+    assert d.brake
+
+
+def test_the_permitted_speed_itself_is_permitted() -> None:
+    d = driving()
+    run(d, 0.0005, qd=24.0)
+    assert state(d) is State.ENABLED
+    run(d, 0.0005, qd=24.0001)
+    assert state(d) is State.FAULT
+
+
+def test_a_motor_that_is_weak_gives_that_share() -> None:
+    d = driving(10.0)
+    d.strength = 0.5
+    for _ in range(20):
+        d.receive(command(10.0))
+        run(d, 0.001)
+    assert d.torque == pytest.approx(5.0, abs=LSB)
+
+
+def test_torque_builds_up_against_the_closed_brake_from_the_first_instant() -> None:
+    d = Drive(rating()._replace(release_ns=10_000_000))
+    d.receive(ENABLE)
+    assert d.silence_ns == 0
+    d.receive(command(10.0))
+    act = d.actuate(HALF_MS)
+    assert d.brake
+    assert act.torque == 0.0
+    assert d.torque > 0.5
+
+
+def test_enable_feeds_the_watchdog_of_an_idle_drive_with_nothing_but_now() -> None:
+    d = Drive(rating())
+    run(d, 0.005)
+    d.receive(ENABLE)
+    assert (d.silence_ns, d.last_valid_ns) == (0, d.uptime_ns)

@@ -11,7 +11,7 @@ from tests.lab import PANDA
 from tools.soak import arm
 from tools.soak.growth import quarters
 
-FINE = arm.Account([arm.Sample((360.0, 150.0, 200.0), 11, 1000, 20)] * 8, 0, 0, 0, [], "")
+FINE = arm.Account([arm.Sample((360.0, 150.0, 200.0), 11, 1000, 20)] * 8, 0, 0, 0, 0, [], "")
 
 
 def test_what_a_start_needs_is_no_growth_and_what_comes_later_is():
@@ -24,6 +24,7 @@ def test_what_a_start_needs_is_no_growth_and_what_comes_later_is():
     "change",
     [
         {"missed": 1},
+        {"dropped": 1},
         {"late": 1},
         {"contacts": 1},
         {"faults": ["push"]},

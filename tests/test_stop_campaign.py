@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from rtctl.campaign.case import Asked
+from rtctl.campaign.play import played
 from rtctl.types import F64, Truth
 from tests.lab import ROOT, robot
-from tools.stop_campaign import ARMS, BRAKES, KINDS, source
+from tools.stop_campaign import ARMS, BRAKES, KINDS, plan, source
 from tools.stop_judge import Course, Run, judged
 
 PLANAR = robot(ROOT / "configs" / "planar4.toml")
@@ -67,3 +68,11 @@ def test_a_joint_that_is_held_may_not_pass_its_limit_and_one_that_falls_may() ->
     over = float((PLANAR.q_max - PLANAR.home)[1]) / (N * DT) * 1.2
     assert any("limit" in text for text in judge("none", "silent", {1: lambda t: over + 0.0 * t}).broken)
     assert not any("limit" in text for text in judge("none", "drive_fault", {1: lambda t: over + 0.0 * t}).broken)
+
+
+@pytest.mark.parametrize("number", [10])
+def test_what_once_broke_a_bound_keeps_it(number: int) -> None:
+    """10: a drive that hears nothing gives its last torque on, and threw the light joints while the others' faded."""
+    (case,) = (case for case in plan(1000, 0, ARMS, ",".join(BRAKES)).cases() if case.number == number)
+    row = played(case)
+    assert (row["outcome"], row["failures"]) == ("stopped", "")

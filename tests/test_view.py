@@ -28,7 +28,7 @@ from rtctl.log.record.tap import Tap
 from rtctl.types import F64, ObstacleEdit, Request, Shape, State, Status, Verb
 from rtctl.view import gate as gates
 from rtctl.view.body import Body
-from rtctl.view.follow import Live, Recorded, Seen, Story
+from rtctl.view.follow import Live, Recorded, Seen, Story, _only
 from rtctl.view.gate import Gate
 from rtctl.view.known import known_obstacles
 from rtctl.view.moment import STATES, STATUSES, Reader, scan_of
@@ -507,3 +507,11 @@ def test_a_page_without_viewers_sends_nothing(record: Recorded) -> None:
         assert record.at == before
     finally:
         page.close()
+
+
+def test_of_several_runs_one_is_named_by_what_tells_them_apart():
+    panda, again, ur5 = (Path(f"/dev/shm/rtctl-{name}.ring") for name in ("panda-1-7", "panda-1-8", "ur5-1-9"))
+    with pytest.raises(LinkError, match=r"by --robot NAME: panda, ur5$"):
+        _only([ur5, panda], "")
+    with pytest.raises(LinkError, match=rf"by --ring FILE: {panda}, {again}$"):
+        _only([again, panda], "")

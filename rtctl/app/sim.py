@@ -7,7 +7,7 @@ from the simulator's account of the truth, which the controller never sees.
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -16,6 +16,7 @@ from rtctl.app.live import Live
 from rtctl.app.servo import Servo
 from rtctl.app.tally import number
 from rtctl.app.vehicle import C, F, M, Play, R, Setup, Sink, Turn, Vehicle
+from rtctl.errors import until_interrupted
 from rtctl.hal.clock import lockstep
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
@@ -159,7 +160,7 @@ def _played(
 def _linger(servo: Servo[R, M, F, C], play: Play[R, M, F, C], live: Live, ticks: int) -> None:
     """Go on for those who look, without the scenario's goals, until a KeyboardInterrupt."""
     dt, begun = servo.robot.dt, time.monotonic()
-    with suppress(KeyboardInterrupt):
+    with until_interrupted():
         for slot in itertools.islice(lockstep(), ticks, None):
             play.look()
             servo.turn(slot, live.asked(slot.slot, play.request(servo.memory)))

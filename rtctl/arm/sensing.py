@@ -22,6 +22,7 @@ from rtctl.arm.detection import (
     encoder_flags,
     examine_feedback,
 )
+from rtctl.arm.disturbance import RESTING
 from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions
 from rtctl.arm.estimator import (
     EstimatorParams,
@@ -130,10 +131,26 @@ def _put_tip(m: RecordRow, tip: TipEstimate) -> None:
 
 
 @kernel
+def _stick(c: RecordRow, m: RecordRow, model: Model, qdd: F64) -> None:
+    """Take from predicted accelerations (n,) [rad/s2] of joints that stand what friction that nobody told of may hold.
+
+    The torque on a joint that sticks grows and the joint does not move. What is external to it follows as it is
+    observed, and that late: of a light wrist it is tens of rad/s2 that never come.
+    """
+    if m.noticed == 0:
+        return
+    for i in range(qdd.shape[0]):
+        if abs(m.qd_measured[i]) < RESTING:
+            held = c.friction_max[i] / model.A[i, i]
+            qdd[i] -= min(max(qdd[i], -held), held)
+
+
+@kernel
 def predict(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: float) -> bool:
     """Advance joints and tip to this slot; return whether the model must be evaluated, or its task space."""
     n = f.q.shape[0]
     qdd = m.qdd[:n].copy()
+    _stick(c, m, model, qdd)
     joints, surprise = joint_step(_joints(m, n), qdd, f.q, f.qd, f.age, f.replies, elapsed, _joint_filter(c, n))
     m.q[:n], m.qd[:n], m.P[:n] = joints.q, joints.qd, joints.P
     for i in range(n):
@@ -181,16 +198,17 @@ def correct(c: RecordRow, m: RecordRow, model: Model) -> None:
 @kernel
 def _monitored(c: RecordRow, m: RecordRow, f: Feedback, model: Model) -> tuple[F64, int]:
     """Return the monitors of the encoders after this tick, and their flags."""
-    n, qdd = f.q.shape[0], m.qdd.copy()
+    n, qdd, held = f.q.shape[0], m.qdd.copy(), c.safety_friction[: f.q.shape[0]].copy()
     if m.noticed != 0:  # one that stands still is held by what is external to it and was not while it moved
         for i in range(n):
             qdd[i] = (m.external_moving[i] - m.external[i]) / model.A[i, i]
+            held[i] += m.unsure[i]  # of that, what a payload takes to be accelerated by the other joints
     return encoder_flags(
         m.encoder_monitors[:, :n].copy(),
         f,
         PreviousPositions(m.q_previous[:n].copy(), m.age_previous[:n].copy(), c.dt * (1 + f.missed)),
         ExpectedMotion(qdd[:n], model.A),
-        EncoderBounds(c.safety_friction[:n].copy(), c.safety_velocity_tolerance[:n].copy()),
+        EncoderBounds(held, c.safety_velocity_tolerance[:n].copy()),
         c.dt,
     )
 

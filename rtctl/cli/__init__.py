@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rtctl.cli import campaign, commission, experiments, init, logs, offline, operate, page, plan
 from rtctl.cli.parser import Parser
-from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, RtctlError, UsageError, lacking
+from rtctl.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, RtctlError, UsageError, lacking, until_interrupted
 
 EXAMPLES = """example:
   rtctl check configs/panda.toml
@@ -52,13 +52,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without our letters shows others, no traceback
         sys.stdout.reconfigure(errors="replace")
     try:
-        code = _run(sys.argv[1:] if argv is None else list(argv))
-        sys.stdout.flush()
-        return code
+        with until_interrupted():
+            code = _run(sys.argv[1:] if argv is None else list(argv))
+            sys.stdout.flush()
+            return code
+        return EXIT_FAILED
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the interpreter's own flush at exit must not fail again
-        return EXIT_FAILED
-    except KeyboardInterrupt:
         return EXIT_FAILED
     except RtctlError as error:
         return _report(str(error), error.exit_code)

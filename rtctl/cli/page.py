@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
     which = view.add_mutually_exclusive_group()
     which.add_argument("--socket", metavar="PATH", default="", help="the daemon's control socket")
     which.add_argument("--robot", metavar="NAME", default="", help="the daemon of this robot; default: the only one")
-    which.add_argument("--ring", metavar="FILE", default="", help=argparse.SUPPRESS)  # of a simulation: sim --view
+    which.add_argument("--ring", metavar="FILE", default="", help="in /dev/shm, of one of several that run")
     add_address(view)
 
 

@@ -187,8 +187,9 @@ def _only(rings: list[Path], robot: str) -> Path:
         whose = f" of {robot}" if robot else ""
         raise LinkError(f"no daemon{whose} of this user runs: start rtctl run, or name a log: rtctl view run.mcap")
     if len(rings) > 1:
-        names = ", ".join(sorted({path.name.removeprefix("rtctl-").split("-")[0] for path in rings}))
-        raise LinkError(f"several daemons run: choose one by --robot NAME: {names}")
+        names = sorted({path.name.removeprefix("rtctl-").split("-")[0] for path in rings})
+        key, told = ("--robot NAME", names) if len(names) == len(rings) else ("--ring FILE", sorted(map(str, rings)))
+        raise LinkError(f"several daemons run: choose one by {key}: {', '.join(told)}")
     return rings[0]
 
 

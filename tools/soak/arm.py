@@ -36,6 +36,7 @@ class Account(NamedTuple):
 
     samples: list[Sample]
     missed: int  # slots
+    dropped: int  # entries of the log
     late: int  # goals that were not reached, by the plant's account
     contacts: int
     faults: list[str]
@@ -101,6 +102,7 @@ class Run:
 
     def sample(self) -> Sample:
         """Take a minute's account; the log's closed segments are read whole, and deleted."""
+        self.pair.lossy = self.told["log"]["dropped"] > 0  # which is told; a hole that is not is a failure
         logs = self.pair.logs()[:-1]
         messages = self.pair.are_whole(logs)
         for path in logs:
@@ -138,7 +140,8 @@ def soak(folder: Path, config: Path, minutes: float, realtime: bool) -> Account:
         pair.end()
     told: dict[str, Any] = run.told if run else {}
     samples, late, faults = (run.samples, run.late, sorted(run.faults)) if run else ([], 0, [])
-    return Account(samples, int(told.get("missed", 0)), late, truth.contacts if truth else 0, faults, failure)
+    lost = (int(told.get("missed", 0)), int(told.get("log", {}).get("dropped", 0)))
+    return Account(samples, *lost, late, truth.contacts if truth else 0, faults, failure)
 
 
 def judged(account: Account) -> bool:
@@ -155,8 +158,8 @@ def judged(account: Account) -> bool:
     goals, read = sum(s.goals for s in account.samples), sum(s.messages for s in account.samples)
     print(
         f"{goals} goals, {account.late} not reached, {account.contacts} contacts, {account.missed} slots missed, "
-        f"{read} messages read, {opened[0]:.1f} then {opened[1]:.1f} descriptors, "
+        f"{read} messages read, {account.dropped} dropped, {opened[0]:.1f} then {opened[1]:.1f} descriptors, "
         f"faults: {', '.join(account.faults) or 'none'}"
     )
-    bad = account.late or account.contacts or account.missed or account.faults or opened[1] - opened[0] > SPARE
-    return not bad and not grown
+    lost = account.missed or account.dropped or account.late
+    return not (lost or account.contacts or account.faults or grown or opened[1] - opened[0] > SPARE)
