@@ -17,6 +17,7 @@ from tests.arms import NO_POINTS, PANDA_HOME, panda
 INFLUENCE, REACH = 0.02, 0.04
 PARAMS = field_params(0.5, INFLUENCE, 0.008, 1e-3, 1.0, 0.0, 50.0)
 UNDAMPED = PARAMS._replace(k_d=0.0)
+NO_ENDS = np.zeros(0)  # no posture of a goal
 
 
 @cache
@@ -117,7 +118,7 @@ def test_the_bounding_balls_hold_their_hulls() -> None:
 def test_without_pairs_nothing_is_measured_and_nothing_pushes() -> None:
     m = panda().evaluate(PANDA_HOME, np.zeros(7), NO_POINTS, nothing())
     assert m.own_rho.shape == (0,)
-    tau, least, flags = own_field(m.own_rho, m.own_row, np.zeros(7), np.zeros(7), m.A_inv, PARAMS)
+    tau, least, flags = own_field(m.own_rho, m.own_row, np.zeros(7), np.zeros(7), m.A_inv, PARAMS, NO_ENDS)
     assert not tau.any()
     assert (least, flags) == (np.inf, 0)
 
@@ -138,7 +139,7 @@ def push(rho: float) -> float:
 
 
 def test_a_pair_is_opened_with_the_acceleration_of_a_unit_mass() -> None:
-    tau, least, flags = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED)
+    tau, least, flags = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED, NO_ENDS)
     assert ROW[0] @ A_INV @ tau == pytest.approx(push(0.012), rel=1e-5)
     assert np.linalg.norm(np.cross(tau, ROW[0])) < 1e-9 * np.linalg.norm(tau)
     assert (least, flags) == (0.012, 0)
@@ -147,21 +148,33 @@ def test_a_pair_is_opened_with_the_acceleration_of_a_unit_mass() -> None:
 def test_distance_follows_the_joints_between_two_evaluations() -> None:
     dq = np.array([0.01, 0.0, -0.002])
     rho = 0.012 + float(ROW[0] @ dq)
-    tau, least, _ = own_field(np.array([0.012]), ROW, dq, np.zeros(3), A_INV, UNDAMPED)
+    tau, least, _ = own_field(np.array([0.012]), ROW, dq, np.zeros(3), A_INV, UNDAMPED, NO_ENDS)
     assert least == pytest.approx(rho)
     assert ROW[0] @ A_INV @ tau == pytest.approx(push(rho), rel=1e-5)
 
 
+def test_links_as_far_apart_as_at_the_goal_do_not_push_and_nearer_they_do() -> None:
+    """The whole potential has its minimum at the goal, unless links are nearer there than their clearance."""
+
+    def along(rho: float, there: float) -> float:
+        tau, _, _ = own_field(np.array([rho]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED, np.array([there]))
+        return float(ROW[0] @ A_INV @ tau)
+
+    assert along(0.012, 0.012) == 0.0 < along(0.011, 0.012) < push(0.011)
+    assert along(0.012, np.inf) == pytest.approx(push(0.012), rel=1e-5)
+    assert along(0.006, 0.006) > 0.0
+
+
 def test_only_closing_is_damped() -> None:
-    still = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, PARAMS)[0]
-    closing = own_field(np.array([0.012]), ROW, np.zeros(3), -ROW[0], A_INV, PARAMS)[0]
-    opening = own_field(np.array([0.012]), ROW, np.zeros(3), ROW[0], A_INV, PARAMS)[0]
+    still = own_field(np.array([0.012]), ROW, np.zeros(3), np.zeros(3), A_INV, PARAMS, NO_ENDS)[0]
+    closing = own_field(np.array([0.012]), ROW, np.zeros(3), -ROW[0], A_INV, PARAMS, NO_ENDS)[0]
+    opening = own_field(np.array([0.012]), ROW, np.zeros(3), ROW[0], A_INV, PARAMS, NO_ENDS)[0]
     assert closing @ ROW[0] > still @ ROW[0] > 0.0
     assert np.allclose(opening, still)
 
 
 @pytest.mark.parametrize("rho", [0.0, -0.03, PARAMS.rho_num])
 def test_contact_is_flagged_bounded_and_still_pushed_apart(rho: float) -> None:
-    tau, _, flags = own_field(np.array([rho]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED)
+    tau, _, flags = own_field(np.array([rho]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED, NO_ENDS)
     assert flags == (CAPPED if rho > 0.0 else CAPPED | CONTACT)
     assert ROW[0] @ A_INV @ tau == pytest.approx(push(PARAMS.rho_num), rel=1e-5)

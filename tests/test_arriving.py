@@ -8,9 +8,9 @@ from rtctl.app.sim import simulate_scenario
 from rtctl.plain import Json
 from rtctl.spec.read import convert
 from rtctl.spec.scenario import Scenario
-from tests.lab import PANDA, ROOT
+from tests.lab import ROOT
 
-CLEARANCE = 0.02  # [m] of configs/panda.toml
+CLEARANCE = 0.02  # [m] of the robots in configs/
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 DOWN = (0.0, 1.0, 0.0, 0.0)
 
@@ -27,6 +27,7 @@ class Case(NamedTuple):
     within: float  # [s] of the goal
     start: tuple[float, ...] = HOME
     planner: bool = False
+    robot: str = "panda"
 
 
 COLUMNS = balls(*((0.52, side, z) for side in (-0.19, 0.19) for z in (0.15, 0.24, 0.33, 0.42, 0.51)))
@@ -68,6 +69,46 @@ CASES = {
         (-1.653732, 1.31829, 0.879154, -0.521153, -1.921463, 3.605905, 0.264111),
         planner=True,
     ),
+    # the wrist of a UR5 turns 14 mm beside its forearm, within what these keep of each other
+    "a tool turned past a folded link": Case(
+        {
+            "position_m": (0.82671, -0.19007, 0.39455),
+            "wxyz": (0.485768831, -0.600556758, -0.497235480, 0.395116566),
+        },
+        (),
+        2.5,
+        (2.67696, -3.01168, 0.46184, -2.04469, -3.37718, 5.5088),
+        robot="ur5",
+    ),
+    # the pose of joints of which the second is on its upper limit: no others have it
+    "a joint on its limit": Case(
+        {
+            "position_m": (0.53741, 0.35426, -0.30866),
+            "wxyz": (0.00180106, 0.6527185, 0.75759203, -0.00310437),
+            "tolerance_m": 0.005,
+            "tolerance_rad": 0.02,
+        },
+        (),
+        3.5,
+    ),
+    # its links are 32 mm above the table, the balls that stand for them 6 mm
+    "over the edge of a table": Case(
+        {
+            "position_m": (-1.02705824, 0.7744814819, 0.0),
+            "wxyz": (0.0421312965, 0.0, 0.0, 0.9991120828),
+        },
+        (
+            {
+                "name": "table",
+                "type": "box",
+                "size_m": (0.8, 0.8, 0.04),
+                "position_m": (-1.02705824, 0.7744814819, -0.08),
+            },
+        ),
+        7.0,
+        (0.422, 1.096, 1.15, -0.611),
+        robot="planar4",
+    ),
 }
 
 
@@ -75,9 +116,9 @@ CASES = {
 def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance(name: str):
     case = CASES[name]
     goal = {"at_s": 0.3, **case.goal}
-    told: Json = {"robot": "panda", "start_q_rad": case.start, "goal": (goal,), "obstacle": case.obstacle}
+    told: Json = {"robot": case.robot, "start_q_rad": case.start, "goal": (goal,), "obstacle": case.obstacle}
     scenario: Scenario = convert({**told, "duration_s": 0.3 + case.within, "planner": case.planner}, Scenario, name)
-    found = simulate_scenario(scenario, PANDA, ROOT / "configs" / "none.toml")
+    found = simulate_scenario(scenario, ROOT / "configs" / f"{case.robot}.toml", ROOT / "configs" / "none.toml")
     assert found["contacts"] == 0
     assert found["min_clearance_m"]["all"] is None or found["min_clearance_m"]["all"] >= CLEARANCE
     assert found["arrived"], found["goals"]

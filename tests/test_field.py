@@ -17,6 +17,7 @@ from rtctl.arm.field import (
     CONTACT,
     Field,
     FieldParams,
+    LimitParams,
     eta_of,
     field,
     field_buffers,
@@ -33,6 +34,7 @@ V, RHO0, RHO_MIN, DT = 0.5, 0.1, 0.02, 1e-3
 UNDAMPED = field_params(V, RHO0, RHO_MIN, DT, 0.0, 0.0, 50.0)
 DAMPED = field_params(V, RHO0, RHO_MIN, DT, 0.7, 0.3, 50.0)
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+NO_ENDS = np.zeros(0)  # no posture of a goal
 
 
 def shape(kind: str, *dims: float, at: tuple[float, ...] = (0, 0, 0), v: tuple[float, ...] = (0, 0, 0)) -> Shape:
@@ -379,7 +381,7 @@ def outputs(seed: int, prefilter: bool = True) -> list[F64]:
     """Return everything that the kernels compute for one random scene."""
     p, qd, o, A_inv, rows = scene(seed)
     out, flags = run(p, qd, o, DAMPED, seed % 2 == 0, prefilter)
-    own, least, flags2 = own_field(rows[:, 0].copy(), rows[:, 1:].copy(), 0.01 * qd, qd, A_inv, DAMPED)
+    own, least, flags2 = own_field(rows[:, 0].copy(), rows[:, 1:].copy(), 0.01 * qd, qd, A_inv, DAMPED, NO_ENDS)
     limit = limit_params(np.full(7, 2.0), np.full(7, 0.3), np.full(7, 0.05), DT, 0.7)
     tau = np.empty(7)
     flags3 = joint_limit_field(qd, qd, np.full(7, -0.4), np.full(7, 0.4), np.ones(7), limit, tau)
@@ -484,6 +486,24 @@ def test_a_joint_at_full_speed_turns_at_its_clearance() -> None:
         q += v * dt
         most = max(most, q)
     assert most == pytest.approx(0.95, abs=2e-4)
+
+
+def test_a_zone_thinner_than_the_clearance_pushes_there_alone_and_is_no_steeper() -> None:
+    """That of a goal on a limit: nothing at the goal, and nowhere a stiffness beyond what a sampled field bears."""
+    thin = LIMIT._replace(rho0=np.array([0.02]))
+    tau = np.empty(1)
+
+    def torque(left: float, params: LimitParams) -> float:
+        joint_limit_field(np.array([1.0 - left]), np.zeros(1), -np.ones(1), np.ones(1), np.ones(1), params, tau)
+        return float(tau[0])
+
+    def stiffness(params: LimitParams) -> float:
+        at = np.linspace(-0.01, 0.3, 20_001)
+        return float(np.abs(np.diff([torque(left, params) for left in at])).max() / (at[1] - at[0]))
+
+    assert torque(0.02, thin) == torque(0.1, thin) == 0.0
+    assert torque(0.0, thin) < torque(0.015, thin) < 0.0
+    assert stiffness(thin) <= 1.01 * stiffness(LIMIT)
 
 
 def test_joint_limit_torque_has_no_jump_and_an_endless_joint_no_limit() -> None:

@@ -32,6 +32,7 @@ from tests.lab import robot, sphere
 from tests.test_law import ZERO, model_at
 
 FREE = np.full(7, np.inf)
+NO_ENDS = np.zeros(0)  # no posture of a goal
 
 
 def bounds_of(low: F64, high: F64, rows: F64 | None = None, most: F64 | None = None) -> Bounds:
@@ -299,7 +300,7 @@ def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch(
     x, v, sent, step = arm.own.reach, -0.5, 0.0, 0.25  # [m], [m/s], [N], [N] in a period
     for _ in range(400):
         qd, rho = np.array([v, 0.0, 0.0]), np.array([x if x < arm.own.reach else np.inf])
-        push, _, _ = own_field(rho, row, ZERO, qd, eye, params)
+        push, _, _ = own_field(rho, row, ZERO, qd, eye, params, NO_ENDS)
         low = np.full(3, -1e6)
         bounds = Bounds(low, -low, np.zeros((2, 3)), np.full(2, np.inf))
         approach = ApproachParams(arm.avoid.rho0, params.rho_min, arm.motion.v_max, arm.motion.a_max)

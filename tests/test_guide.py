@@ -16,7 +16,7 @@ from rtctl.app.postures import endings, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
-from rtctl.arm.field import Ends, MovingPoints, field_buffers, field_to
+from rtctl.arm.field import APART, Ends, MovingPoints, field_buffers, field_to
 from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, placements, points_at, tip_at
 from rtctl.arm.memory import MEASURED_POSTURE, Memory
@@ -98,14 +98,14 @@ def test_the_whole_potential_has_its_minimum_at_the_goal():
         at[1] += 0.03 - rho.min()
     points = MovingPoints(model.P, model.Jp, model.B, arm.points.radius, arm.points.link)
     out, still = field_buffers(arm.slots, len(model.P), 7), np.zeros(7)
-    ends = Ends(model.P.copy(), rho.copy(), 1.05 * arm.avoid.rho_min)
+    ends = Ends(model.P.copy(), rho.copy(), 1.05 * arm.avoid.rho_min, APART, 0.0, np.zeros(0))
     assert rho.min() == pytest.approx(0.03, abs=1e-3)
 
     def push(dq: np.ndarray, goal: Ends) -> np.ndarray:
         field_to(points, dq, still, obstacles, arm.avoid, out, True, True, goal)
         return out.tau.copy()
 
-    nowhere = Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0)
+    nowhere = Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0, APART, 0.0, np.zeros(0))
     assert np.abs(push(still, nowhere)).max() > 1.0
     assert np.abs(push(still, ends)).max() == 0.0
     for dq in 0.01 * np.random.default_rng(1).standard_normal((50, 7)):
@@ -238,6 +238,23 @@ def test_the_process_advises_is_never_waited_for_and_ends():
         adviser.close()
     with pytest.raises(ProcessLookupError):
         os.kill(adviser.pid, 0)
+
+
+def test_joints_that_are_led_and_held_are_said_to_be_so_within_two_seconds(monkeypatch):
+    """Beyond a wall, by somebody who sees none: the wall is named, by pybullet within the influence."""
+    beyond = np.array([1.2, *HOME[1:]])
+    monkeypatch.setattr(Guide, "advise", lambda self, m: None if m.goal is None else Advice(beyond, leads=True))
+    wall = {"name": "wall", "type": "box", "size_m": (1.2, 0.02, 1.6), "position_m": (0.5, 0.25, 0.4)}
+    goal = {"at_s": 0.3, "position_m": (0.2, 0.5, 0.45)}
+    found = played(duration_s=4.5, goal=(goal,), obstacle=(wall,))
+    assert found["contacts"] == 0
+    assert not found["arrived"]
+    told = [(t, status, detail) for t, status, detail in found["statuses"] if status not in ("moving", "planned")]
+    assert told
+    assert told[0][0] < 4.3  # it stands within two seconds
+    assert "wall at " in told[-1][2]
+    assert found["statuses"][-1] == list(told[-1])
+    assert found["min_clearance_m"]["wall"] < 0.1
 
 
 def test_a_posture_measured_among_other_obstacles_is_not_trusted_beside_a_new_one():

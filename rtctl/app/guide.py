@@ -17,13 +17,14 @@ from rtctl.app.postures import (
     endings,
     free_of_all,
     links_clear,
+    own_room,
     packed,
     previewed,
     site_of,
     straight_room,
     swept,
 )
-from rtctl.app.way import Way, comes, heading, moves, progress, way_of, yielding
+from rtctl.app.way import Way, comes, heading, moves, progress, travelled, way_of, yielding
 from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
@@ -46,7 +47,8 @@ HELD = frozenset(
         Status.SATURATED,
     )
 )
-NEAR = 0.06  # [rad] from the end of a way, where the goal itself is headed for
+ZONES = (1.0, 0.4, 0.0)  # of those of joint limits, that a posture keeps free of; tried in this order
+NEAR, NEARLY = 0.06, 0.015  # [rad], [m] of points, from the end of a way, where the goal itself is headed for
 STUCK = 0.8  # [s] without progress along a way
 SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
 PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
@@ -82,6 +84,7 @@ def warm(robot: Robot) -> None:
     endings(site, goal, 0, seeds=1)
     previewed(site, goal, robot.q_rest)
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
+    heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
     body, anchors = body_of(robot), robot.home[None]
     first_blocked(body, anchors, site.obstacles, Room(0.0, 0.0, anchors, np.zeros((1, 2))), 1.0)
 
@@ -165,7 +168,7 @@ class Guide:
         Q, there = previewed(site, goal, self.robot.q_rest)
         if there and free_of_all(site, Q[-1]):
             return None
-        self.ends = endings(site, goal, self.seed)
+        self.ends = self._endings(site, goal)
         for end in self.ends:
             Q, there = previewed(site, goal, end.q)
             if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
@@ -173,9 +176,12 @@ class Guide:
         led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)
         if led is not None:
             return led
-        if not there and self.plans:
-            return self._planned(m, goal, site)
-        return self._given(self.ends[0]) if self.ends else None
+        planned = self._planned(m, goal, site) if not there and self.plans else None
+        return planned or (self._given(self.ends[0]) if self.ends else None)
+
+    def _endings(self, site: Site, goal: Goal) -> list[Ending]:
+        """Return postures that have the goal, as far from joint limits as there are any."""
+        return next((ends for zone in ZONES if (ends := endings(site, goal, self.seed + self.tries, zone))), [])
 
     def _given(self, end: Ending) -> Advice:
         self.given = end
@@ -197,7 +203,8 @@ class Guide:
 
     def _clear(self, site: Site, Q: F64) -> bool:
         rho = clearance_of(site.chain, self.robot.points, Q, site.obstacles)
-        return bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
+        apart = own_room(site, Q) >= self.robot.self_avoid.rho_min
+        return apart and bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
 
     def _straight(self, site: Site, end: Ending) -> Advice | None:
         """Take the straight way to a posture where it is free."""
@@ -219,7 +226,7 @@ class Guide:
         if m.status == Status.ESCAPING or self.tries >= PLANS or not self.robot.postures:
             return None
         self.tries += 1
-        self.ends = endings(site, goal, self.seed + self.tries)
+        self.ends = self._endings(site, goal)
         far = [end for end in self.ends if np.abs(end.q - site.start).max() > 3.0 * NEAR]
         return next((advice for end in far if (advice := self._straight(site, end)) is not None), None)
 
@@ -260,7 +267,7 @@ class Guide:
         site, dt, at = self._site(m), self.robot.dt, progress(way, self.at, m.q)
         if at > self.at or self.moved_at < 0:
             self.at, self.moved_at = at, m.tick
-        if np.abs(m.q - way.Q[-1]).max() < NEAR:
+        if np.abs(m.q - way.Q[-1]).max() < NEAR and travelled(site, way.Q[-1:])[0] < NEARLY:
             self.way, self.again = None, m.tick + round(AGAIN / dt)
             return self._given(way.end)
         if changed or ((self.blocked or moves(site)) and m.tick >= self.look):

@@ -23,7 +23,7 @@ SEEDS = 48  # random starts
 ENDS = 8  # postures returned at most
 ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
-HAIR = 0.2  # of the clearance from joint limits, that no posture is without
+HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
@@ -164,11 +164,23 @@ def previewed(site: Site, goal: Goal, rest: F64) -> tuple[F64, bool]:
 
 
 def free_of_all(site: Site, q: F64) -> bool:
-    """Return whether a posture is felt by no limit and no obstacle."""
+    """Return whether a posture is felt by no limit, no obstacle and no other link."""
     robot = site.robot
     margin = np.minimum(q - robot.q_min, robot.q_max - q)
     rho = clearance_of(site.chain, robot.points, q[None], site.obstacles)[0]
-    return bool((margin >= robot.limit.rho0).all() and rho >= robot.avoid.rho0)
+    return bool(
+        (margin >= robot.limit.rho0).all()
+        and rho >= robot.avoid.rho0
+        and own_room(site, q[None]) >= robot.self_avoid.rho0
+    )
+
+
+def own_room(site: Site, Q: F64) -> float:
+    """Return the least distance [m] between links in some of the postures Q (b, n), inf where none are near."""
+    robot = site.robot
+    if not len(robot.own.pairs):
+        return np.inf
+    return min(float(robot.body.own_distances(q, robot.own).min()) for q in Q[:: max(1, len(Q) // 12)])
 
 
 def along(a: F64, b: F64, step: float) -> F64:
@@ -186,7 +198,4 @@ def straight_room(site: Site, a: F64, b: F64, step: float = 0.06) -> float:
     robot = site.robot
     Q = along(a, b, step)
     rho = float(clearance_of(site.chain, robot.points, Q, site.obstacles).min())
-    if rho > 0.0 and len(robot.own.pairs):
-        own = min(float(robot.body.own_distances(q, robot.own).min()) for q in Q[:: max(1, len(Q) // 12)])
-        return rho if own >= robot.self_avoid.rho_min else 0.0
-    return rho
+    return 0.0 if rho > 0.0 and own_room(site, Q) < robot.self_avoid.rho_min else rho

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.app.postures import Ending, Site, along, links_clear
-from rtctl.arm.kinematics import clearance_of, clearances
+from rtctl.arm.kinematics import clearance_of, clearances, travels
 from rtctl.types import B1, F64, Advice
 
 FINE = 0.03  # [rad] between two postures of a way
-AHEAD = 0.22  # [s] of full speed that the posture to head for is ahead
+AHEAD, POINTS_AHEAD = 0.22, 0.35  # [s] of full speed of joints, and of points, that the posture to head for is ahead
 NEXT = 40  # postures ahead among which progress is looked for, and back, to which it backs off
 SURE = 0.6  # of the way's own clearance that the straight line to it keeps
 HORIZON = 1.2  # [s] of what moves that is looked at
@@ -45,10 +45,14 @@ def progress(way: Way, at: int, q: F64) -> int:
 
 
 def heading(site: Site, way: Way, at: int, checked: bool) -> Advice:
-    """Return the posture to head for from the start; checked: no farther than the straight line to it is free."""
-    robot, q = site.robot, site.start
-    away = (np.abs(way.Q[at:] - q) / _full_speed(site)).max(axis=1)
-    reach = np.flatnonzero(away <= AHEAD)
+    """Return the posture to head for from the start; checked: no farther than the straight line to it is free.
+
+    Of joints and of points: for the way there the field of what rests is that of the posture.
+    """
+    robot, q, next_ones = site.robot, site.start, way.Q[at : at + NEXT]
+    joints = (np.abs(next_ones - q) / _full_speed(site)).max(axis=1)
+    points = travelled(site, next_ones) / robot.motion.v_max
+    reach = np.flatnonzero((joints <= AHEAD) & (points <= POINTS_AHEAD))
     ahead = at + int(reach[-1]) if len(reach) else min(at + 1, len(way.Q) - 1)
     while checked and ahead > at + 1:
         rho = float(clearance_of(site.chain, robot.points, along(q, way.Q[ahead], 2.0 * FINE), site.obstacles).min())
@@ -56,6 +60,12 @@ def heading(site: Site, way: Way, at: int, checked: bool) -> Advice:
             break
         ahead = at + (ahead - at) // 2
     return Advice(way.Q[ahead], True, bool(way.clear[ahead]))
+
+
+def travelled(site: Site, Q: F64) -> F64:
+    """Return how far (b,) [m] the point that goes farthest is from where it is at the start, at postures Q (b, n)."""
+    p = site.robot.points
+    return travels(site.chain, p.link, p.local, site.start, Q)
 
 
 def moves(site: Site) -> bool:

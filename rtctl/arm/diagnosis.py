@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm.field import Field, own_field
-from rtctl.arm.memory import Memory
+from rtctl.arm.memory import Memory, record_of
 from rtctl.arm.robot import Robot
+from rtctl.arm.target import leads
 from rtctl.arm.task import error_of, selected, task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec, symmetric_eigen, tmatvec
@@ -40,12 +41,12 @@ class Balance(NamedTuple):
 
 
 class GoalDrive(NamedTuple):
-    """What drives the tip to its goal: tau_m = J^T Lambda F."""
+    """What drives the tip to its goal, tau_m = J^T Lambda F, or joints that are led, tau_m = A k_v qd_ref."""
 
     F: F64  # (6,) [m/s2, rad/s2] that the goal asks for
     J: F64  # (6, n)
     A_inv: F64  # (n, n)
-    Lambda: F64  # (6, 6)
+    tau: F64  # (n,) [Nm]
 
 
 class OpposingTorques(NamedTuple):
@@ -101,11 +102,20 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
     """
     assert m.goal is not None
     e, _ = task_error(int(m.goal.task), m.goal.axis, m.goal.position, m.goal.wxyz, m.tip.x, m.tip.R)
+    led = leads(record_of(m.hot)[0])
     tau_own, _, _ = own_field(
-        m.model.own_rho, m.model.own_row, m.joints.q - m.model.q, m.joints.qd, m.model.A_inv, robot.self_avoid
+        m.model.own_rho,
+        m.model.own_row,
+        m.joints.q - m.model.q,
+        m.joints.qd,
+        m.model.A_inv,
+        robot.self_avoid,
+        m.ends[3 * len(robot.points.radius) :] if m.goal.posture is not None else np.zeros(0),
     )
+    F = _drive(robot, m)
+    tau_m = robot.motion.k_v * matvec(m.model.A, m.lead) if led else tmatvec(m.model.J, matvec(m.space.Lambda, F))
     obstacles, limits, own, granted = _shares(
-        GoalDrive(_drive(robot, m), m.model.J, m.model.A_inv, m.space.Lambda),
+        GoalDrive(F, m.model.J, m.model.A_inv, tau_m),
         OpposingTorques(tau_own, m.tau_obstacles, tau_limits),
         robot.scratch,
         m.model.Jp,
@@ -116,11 +126,11 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         obstacles,
         limits,
         own,
-        granted,
+        1.0 if led else granted,
         np.abs(tau_wanted) / robot.tau_max,
         m.goal_rho,
         robot.avoid.rho0,
-        norm(e) > m.goal.tolerance and at_edge(m.model.J, e),
+        not led and norm(e) > m.goal.tolerance and at_edge(m.model.J, e),
     )
 
 
@@ -136,10 +146,9 @@ def _shares(
     drive: GoalDrive, opposed: OpposingTorques, field: Field, Jp: F64, link: I64, gaps: LimitGaps
 ) -> tuple[F64, F64, float, float]:
     """Return the fields of `Balance` from `obstacles` to `granted`; Jp (m, 3, n) and link (m,) of the points."""
-    F, J, A_inv, Lambda = drive
+    F, J, A_inv, tau_m = drive
     tau_own, tau_obstacles, tau_limits = opposed
     n, slots = tau_own.shape[0], field.leader.shape[0]
-    tau_m = tmatvec(J, matvec(Lambda, F))
     qdd = matvec(A_inv, tau_m)
     has = matvec(J, qdd)
     total, wanted, given, scale = 1e-12, 1e-12, 0.0, 1.0
@@ -206,8 +215,10 @@ def names(robot: Robot, m: Memory, found: Blockers) -> tuple[str, ...]:
             return (_lost(robot, m, found.status),)
         case Status.LOCAL_MINIMUM if not order:
             pair = int(m.model.own_rho.argmin()) if len(m.model.own_rho) else -1
-            near = pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0
-            return (" and ".join(robot.own.names[pair]),) if near else (UNKNOWN,)
+            if pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0:
+                return (" and ".join(robot.own.names[pair]),)
+            k = int(m.rho.argmin())  # what no field holds is held by a guard of what is near
+            return (f"{m.world.names[k]} at {_nearest(robot, k)}",) if m.rho[k] < robot.avoid.rho0 else (UNKNOWN,)
         case _:
             return tuple(f"{m.world.names[k]} at {_link(robot, k)}" for k in order)
 
@@ -215,6 +226,11 @@ def names(robot: Robot, m: Memory, found: Blockers) -> tuple[str, ...]:
 def _link(robot: Robot, k: int) -> str:
     """Return the link that obstacle k pushes most."""
     return robot.points.names[int(robot.scratch.pairs[k, 5].argmax())]
+
+
+def _nearest(robot: Robot, k: int) -> str:
+    """Return the link that is nearest to obstacle k."""
+    return robot.points.names[int(robot.scratch.pairs[k, 0].argmin())]
 
 
 def _lost(robot: Robot, m: Memory, status: Status) -> str:

@@ -13,7 +13,7 @@ arm's motion would otherwise feed back into the zone and break the energy balanc
 import math
 from typing import NamedTuple
 
-from rtctl.arm.joint_field import joint_limit_field, own_field, self_collision
+from rtctl.arm.joint_field import LEAST_REACH, joint_limit_field, own_field, self_collision
 from rtctl.control.firas import (
     CAPPED,
     CONTACT,
@@ -52,7 +52,7 @@ __all__ = [
 
 
 APART = 0.5  # of the way to its place in the goal's posture, by which a point's influences are wider than there
-LEAST_REACH = 1.05  # of the clearance, or of what takes its place: influence is never less
+APART_LED = 0.0  # while the joints are led: the way to a posture that is a moment ahead is known to be free
 
 # Rows of Field.points and Field.pairs.
 _P, _V, _B, _F = 0, 3, 6, 12
@@ -75,6 +75,9 @@ class Ends(NamedTuple):
     P: F64  # (m, 3) [m]
     rho: F64  # (K, m) [m] from each obstacle there
     least: float  # [m] below which no influence shrinks
+    apart: float  # APART, or APART_LED
+    beside: float  # [m] from its place, within which a point's influences are no wider than there
+    own: F64  # (L,) [m] between the links of the arm there
 
 
 @leaf_kernel
@@ -83,10 +86,10 @@ def _reach(ends: Ends, k: int, j: int, points: F64, params: FieldParams) -> floa
 
     The field then vanishes in the goal's posture, which is the minimum of the whole potential (goals non-reachable with
     obstacles nearby: Ge and Cui 2000). Away from it influence grows by less than the distance: a point beside its place
-    is not pushed about it, |e| away at the same height it feels APART |e| at most.
+    is not pushed about it, |e| away at the same height it feels `apart` |e| at most.
     """
     x, y, z = points[_P, j] - ends.P[j, 0], points[_P + 1, j] - ends.P[j, 1], points[_P + 2, j] - ends.P[j, 2]
-    reach = ends.rho[k, j] + APART * math.sqrt(x * x + y * y + z * z)
+    reach = ends.rho[k, j] + ends.apart * max(math.sqrt(x * x + y * y + z * z) - ends.beside, 0.0)
     bounded: float = min(max(reach, ends.least), params.rho0)
     return bounded
 
@@ -149,8 +152,9 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: 
         reach = _reach(ends, k, j, points, params) if near_goal else rho0 + look_ahead * wide
         if pairs[k, RHO, j] >= reach:
             continue
-        clearance = min(rho_min, reach / LEAST_REACH)
-        a, d = firas(pairs[k, RHO, j], rho_dot, reach, clearance, rho_num, eta, k_d)
+        clearance, least = min(rho_min, reach / LEAST_REACH), min(rho_num, reach / LEAST_REACH)
+        thin = least / rho_num  # a zone thinner than rho_num is as steep as the others at most
+        a, d = firas(pairs[k, RHO, j], rho_dot, reach, clearance, least, thin * thin * thin * thin * eta, k_d)
         b = x * x * points[_B, j] + y * y * points[_B + 1, j] + z * z * points[_B + 2, j]
         b += 2.0 * (x * y * points[_B + 3, j] + x * z * points[_B + 4, j] + y * z * points[_B + 5, j])
         pairs[k, ACCELERATION, j] = a
@@ -278,7 +282,8 @@ def field(
     prefilter: bool,
 ) -> int:
     """Return `field_to` no posture in particular."""
-    return field_to(points, dq, qd, obstacles, params, out, blend, prefilter, Ends(points.P[:0], out.share[:0], 0.0))
+    nowhere = Ends(points.P[:0], out.share[:0], 0.0, APART, 0.0, out.tau[:0])
+    return field_to(points, dq, qd, obstacles, params, out, blend, prefilter, nowhere)
 
 
 @leaf_kernel

@@ -12,6 +12,7 @@ from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into
 
+BALLS = 0.005  # [m] that the points keep all the same: one that touches stops the arm
 RELAX = 0.3  # [m/rad] by which what must be kept free grows from what an anchor has
 
 
@@ -118,13 +119,14 @@ def first_blocked(body: Body, Q: F64, obstacles: Obstacles, room: Room, share: f
                     P[i, j] += R[l, i, 2] * body.local[j, 2]
             distances_into(P, body.radius, obstacles, room.rho, rho)
             keep = share * min(free, body.skin.keep)
+            most = max(keep - body.skin.overhang, share * min(free, BALLS))  # that is asked of the points themselves
             for j in range(m):
                 least = np.inf
                 for o in range(rho.shape[0]):
                     least = min(least, rho[o, 0, j])
                 if least >= share * free:
                     continue
-                if body.skin.start.shape[0] == 0 or least < keep - body.skin.overhang:
+                if body.skin.start.shape[0] == 0 or least < most:
                     return k
                 if not _skin_keeps(body, j, R, t, obstacles, keep):
                     return k

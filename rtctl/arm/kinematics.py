@@ -151,6 +151,18 @@ def points_at(chain: Chain, link: I64, local: F64, q: F64) -> F64:
 
 
 @kernel
+def travels(chain: Chain, link: I64, local: F64, q: F64, Q: F64) -> F64:
+    """Return how far (b,) [m] the point that goes farthest is from where it is at q (n,), at postures Q (b, n)."""
+    here, out = points_at(chain, link, local, q), np.zeros(Q.shape[0])
+    for b in range(Q.shape[0]):
+        there = points_at(chain, link, local, Q[b])
+        for j in range(link.shape[0]):
+            x, y, z = there[0, j] - here[0, j], there[1, j] - here[1, j], there[2, j] - here[2, j]
+            out[b] = max(out[b], np.sqrt(x * x + y * y + z * z))
+    return out
+
+
+@kernel
 def _least(rho: F64) -> float:
     least = np.inf
     for k in range(rho.shape[0]):

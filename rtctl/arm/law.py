@@ -12,6 +12,7 @@ import numpy as np
 from rtctl.arm.bounds import ApproachParams, Bounds, MotionLimits, SelfPairs, joint_bounds, self_bounds, tip_bound
 from rtctl.arm.escape import STALL
 from rtctl.arm.field import (
+    APART,
     CAPPED,
     Ends,
     Field,
@@ -166,7 +167,8 @@ class Motion(NamedTuple):
 
 def nothing_ahead(robot: Robot) -> Ahead:
     """Return what is known without a posture of the goal."""
-    return Ahead(Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0), robot.limit.rho0.copy(), False, np.zeros(robot.n))
+    nowhere = Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0, APART, 0.0, np.zeros(0))
+    return Ahead(nowhere, robot.limit.rho0.copy(), False, np.zeros(robot.n))
 
 
 def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles: Obstacles, motion: Motion) -> Law:
@@ -417,7 +419,9 @@ def _torques(
     dq, load, tau_max = w[_DQ], w[_LOAD], limits.tau_max
     points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
     flags = field_to(points, dq, qd, obstacles, p.avoid, seen, True, True, ahead.ends)
-    rho_self, more = self_collision(model.own_rho, model.own_row, dq, qd, model.A_inv, p.self_collision, w[_SELF])
+    rho_self, more = self_collision(
+        model.own_rho, model.own_row, dq, qd, model.A_inv, p.self_collision, ahead.ends.own, w[_SELF]
+    )
     zones = LimitParams(ahead.zone, p.limit.rho_min, p.limit.rho_num, p.limit.eta, p.limit.k_d)
     joint_limit_field(q, qd, limits.q_min, limits.q_max, w[_DIAGONAL], zones, w[_LIMITS])
     for i in range(n):

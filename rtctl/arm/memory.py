@@ -203,7 +203,7 @@ class Memory(msgspec.Struct, frozen=True):
     placed: World  # the obstacles when they were last edited
     table: F64  # where they are now, and how far from arm and goal; see `flat`
     shapes: F64  # what does not change of them between edits
-    ends: F64  # (m, 3) [m] the points in the goal's posture, where there is one
+    ends: F64  # (3 m + L,) [m] the points in the goal's posture, where there is one, and how far its links are apart
     grippers: F64  # (10, g) what its grippers remember; see `gripper`
 
     def __getattr__(self, name: str) -> Any:

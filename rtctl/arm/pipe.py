@@ -33,7 +33,7 @@ from rtctl.arm.servo_level import (
     servo,
 )
 from rtctl.arm.supervision import hold_at, supervise, with_advice, with_goal
-from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, pursues
+from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, leads, pursues
 from rtctl.arm.task import between, point_of
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.types import (
@@ -139,7 +139,7 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
         shapes_of(table.obstacles, table.moving, table.creep, table.stale),
         table_of(table.obstacles, table.age, far, far),
     )
-    ends, grippers = np.zeros((len(robot.points.radius), 3)), unasked(len(robot.grippers))
+    ends, grippers = np.zeros(3 * len(robot.points.radius) + len(robot.own.pairs)), unasked(len(robot.grippers))
     return Memory(fresh(), robot.n, "", (), model, parameters, table, places, shapes, ends, grippers)._replace(
         tick=-1,
         state=State.IDLE,
@@ -225,6 +225,9 @@ def _diagnosed(robot: Robot, m: Memory, before: Memory, record: Record) -> Memor
 def _blocked(robot: Robot, m: Memory, before: Memory, record: Record) -> Memory:
     goal, still = m.goal, m.still
     assert goal is not None
+    if leads(record_of(m.hot)[0]):
+        found = diagnosis.blockers(_balance(robot, m, record))
+        return _with_blockers(robot, m, found)._replace(status=found.status)
     error = record["error"].item()
     stall, waited = round(robot.stop.stall / robot.dt), _waited(robot, before)
     circles = robot.escape and m.escape.phase == escape.Phase.NONE

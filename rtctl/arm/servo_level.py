@@ -12,9 +12,10 @@ import numpy as np
 
 from rtctl.arm.escape import Phase
 from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
-from rtctl.arm.field import LEAST_REACH, Ends
+from rtctl.arm.field import APART, APART_LED, Ends
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
 from rtctl.arm.friction import rubbing
+from rtctl.arm.joint_field import LEAST_REACH
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Ahead, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
 from rtctl.arm.loads import loaded, observe, pushed
@@ -50,6 +51,8 @@ SETTLE = 0.2  # [s] of holding torque before RUN: brakes open and the torque bui
 ENABLE_TIMEOUT = 1.0  # [s] for every drive to report enabled
 FADE = 0.004  # [s] in which the torque of a stop without true measurements goes: a deaf drive gives its last on
 FASTER = 0.2  # [rad/s] above its speed at the onset of a stop: the joint is driven, not damped; brakes take their time
+THINNEST = 1e-3  # [m] no influence is less
+BESIDE = 0.03  # [m] from where points are in such a posture, within which no influence is wider than there
 STOP_TIME = 3.0  # [s] STOPPING gives up waiting for rest: something keeps pushing, brakes do the rest
 
 # numbers of the enumerations, as compiled code reads them
@@ -213,16 +216,22 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
 
 
 @kernel
-def _ahead(arm: Arm, m: RecordRow, obstacles: Obstacles, points: F64, n: int) -> Ahead:
-    """Return what is known of the posture that the goal is pursued in; points (m, 3) [m] in it."""
+def _ahead(arm: Arm, m: RecordRow, obstacles: Obstacles, ends: F64, n: int) -> Ahead:
+    """Return what is known of the posture that the goal is pursued in; ends: of the memory."""
     c, rho0 = arm.constants[0], arm.constants[0].avoid_rho0
+    placed = 3 * arm.radius.shape[0]
+    points = ends[:placed].reshape(arm.radius.shape[0], 3)
     if m.has_posture == 0 or not pursues(m):
-        return Ahead(Ends(points[:0], np.empty((0, 0)), 0.0), c.limit_rho0[:n].copy(), False, np.zeros(n))
+        nowhere = Ends(points[:0], np.empty((0, 0)), 0.0, APART, 0.0, ends[:0])
+        return Ahead(nowhere, c.limit_rho0[:n].copy(), False, np.zeros(n))
     found = np.empty((obstacles.active.shape[0], 4, points.shape[0]))
     distances_into(points.T.copy(), arm.radius, obstacles, rho0, found)
     # the points stand out of the links: where the links themselves are known to keep the clearance, points need not
-    least = LEAST_REACH * (c.avoid_rho_num if m.has_posture == MEASURED_POSTURE else c.avoid_rho_min)
-    return Ahead(Ends(points, found[:, 0].copy(), least), limit_zones(c, m, n), leads(m), m.lead[:n].copy())
+    measured = m.has_posture == MEASURED_POSTURE
+    least, beside = (THINNEST, BESIDE) if measured else (LEAST_REACH * c.avoid_rho_min, 0.0)
+    led = leads(m)
+    there = Ends(points, found[:, 0].copy(), least, APART_LED if led else APART, beside, ends[placed:])
+    return Ahead(there, limit_zones(c, m, n), led, m.lead[:n].copy())
 
 
 @kernel

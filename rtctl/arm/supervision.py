@@ -147,7 +147,13 @@ def to_park(robot: Robot, m: Memory) -> Memory:
     goal = Goal(x, R, nothing, 1.0, PARK_TOLERANCE, posture=robot.park)
     rho = obstacle_table.distance_from(m.world, x)
     m = free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, parking=True, floating=False)
-    return m._replace(ends=m.ends if robot.park is None else robot.body.placed(robot.park, robot.points))
+    return m._replace(ends=m.ends if robot.park is None else ends_of(robot, robot.park))
+
+
+def ends_of(robot: Robot, q: F64) -> F64:
+    """Return what `Memory.ends` holds of a posture q (n,)."""
+    ends: F64 = np.concatenate([robot.body.placed(q, robot.points).ravel(), robot.body.own_distances(q, robot.own)])
+    return ends
 
 
 def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
@@ -171,7 +177,7 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
     if refusal:
         return m._replace(refusal=refusal)
     if goal.posture is not None:
-        ends = robot.body.placed(goal.posture, robot.points)
+        ends = ends_of(robot, goal.posture)
     return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, floating=False, ends=ends)
 
 
@@ -185,7 +191,7 @@ def with_advice(robot: Robot, m: Memory, request: Request) -> Memory:
         return m
     known = goal.posture is not None and np.array_equal(goal.posture, advice.posture)
     led = m.tick <= m.lead_until
-    m = m._replace(goal=goal._replace(posture=advice.posture), ends=robot.body.placed(advice.posture, robot.points))
+    m = m._replace(goal=goal._replace(posture=advice.posture), ends=ends_of(robot, advice.posture))
     if advice.clear:
         m = m._replace(has_posture=MEASURED_POSTURE)
     if advice.leads:

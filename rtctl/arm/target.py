@@ -10,10 +10,10 @@ import numpy as np
 
 from rtctl.arm.escape import Escape, Phase, advance, push_along, way
 from rtctl.arm.faults import BRAKES
-from rtctl.arm.field import APART, LEAST_REACH
+from rtctl.arm.field import APART
 from rtctl.arm.law import motion_params
 from rtctl.arm.model import Model
-from rtctl.arm.progress import STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
+from rtctl.arm.progress import GAIN, STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
 from rtctl.arm.task import point_along, selected, task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, norm
@@ -22,6 +22,8 @@ from rtctl.types import F64, TOOL_Z, RecordRow, State, Status
 
 START_SPEED_SCALE = 0.1  # fraction of qd_max that joints may have while ARMED, and beyond their limits
 START_TIME = 0.5  # [s] about, in which they are given the rest
+THINNEST = 0.2  # of the clearance from joint limits: no zone of theirs is thinner
+LED = 0.02  # [rad/s] of joints that are led: what is slower is where it is led to
 SLOW_REFERENCE = 1e-3  # [m/s, rad/s] below it braking is over
 
 # what the timers ask for
@@ -95,7 +97,7 @@ def limit_zones(c: RecordRow, m: RecordRow, n: int) -> F64:
             q, goal = m.q[i], m.goal_posture[i]
             low, high = c.q_min[i], c.q_max[i]
             margin = (goal - low if q - low < high - q else high - goal) + APART * abs(q - goal)
-            zone[i] = min(zone[i], max(margin, LEAST_REACH * c.limit_rho_min[i]))
+            zone[i] = min(zone[i], max(margin, THINNEST * c.limit_rho_min[i]))
     return zone
 
 
@@ -230,6 +232,16 @@ def parking_progress(m: RecordRow, n: int) -> Progress:
 
 
 @kernel
+def _drags(m: RecordRow) -> bool:
+    """Return whether joints that are led do not follow: they have less than GAIN of the speed that is wanted."""
+    wanted = along = 0.0
+    for i in range(m.lead.shape[0]):
+        wanted += m.lead[i] * m.lead[i]
+        along += m.lead[i] * m.qd[i]
+    return bool(wanted > LED * LED and along < GAIN * wanted)
+
+
+@kernel
 def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> int:
     """Advance the timers of the way to the goal; return DIAGNOSE when it is time to ask what holds the arm."""
     if m.has_goal == 0 or m.state != _RUN:
@@ -244,9 +256,12 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
         _no_escape(m)
         m.still = m.still + 1
         return changed
-    if leads(m):  # who leads sees to the progress
-        m.still, m.nearest, m.stall_timer = 0, np.inf, 0.0
-        return _take_status(m, _MOVING)
+    if leads(m):
+        before = _waited(c, m)
+        m.still, m.nearest, m.stall_timer = 0, np.inf, max(0.0, m.stall_timer + (c.dt if _drags(m) else -2.0 * c.dt))
+        if not _waited(c, m):
+            return _take_status(m, _MOVING)
+        return SAME if before and m.tick % int(c.review_ticks) else DIAGNOSE
     if _circulates(m) or m.escape_phase == _CHOOSING:
         m.status, m.still = _ESCAPING, 0  # held by what it circulates
         return SAME

@@ -22,6 +22,7 @@ from rtctl.types import F64, Status
 
 KEPT = 0.3  # [s] that a goal is watched when nothing moves any more
 REST = 0.012  # [m/s] of the tip: slower, and the arm stands
+STEP = 1e-4  # [rad] below what an encoder of a joint tells: a start on a limit is no violation
 LIMITS = (  # figure, its bound, what it is called
     ("max_torque_ratio", 1.0 + 1e-9, "torque"),
     ("max_torque_rate_ratio", 1.0 + 1e-6, "torque rate"),
@@ -168,7 +169,7 @@ def broken(figures: Json, finite: bool) -> list[str]:
         if value is not None and not value <= bound:
             found.append(f"{what} at {value:.4f} of its limit")
     margin = figures.get("min_joint_margin_rad")
-    if margin is not None and margin < 0.0:
+    if margin is not None and margin < -STEP:
         found.append(f"a joint {-margin:.4f} rad beyond its limit")
     return found
 
