@@ -167,7 +167,7 @@ def test_register_frames_by_hand() -> None:
 
 
 def test_registers_and_their_names_are_those_of_the_published_driver() -> None:
-    ours = {**mit.REGISTERS, mit.BAUD: "can_br"}  # as it calls the rate
+    ours = mit.REGISTERS | {n: "can_br" for n, name in mit.REGISTERS.items() if name == "BAUD"}  # as it calls the rate
     assert ours == {number: REGISTER_TABLE[number].variable for number in ours}
     assert set(ours) == {7, 8, 9, 10, 21, 22, 23, 35}
     assert {number for number in ours if REGISTER_TABLE[number].data_type == "float"} == mit.FLOATS

@@ -91,14 +91,15 @@ class Run:
             raise Failed(f"a goal was refused: {answer}")
         self.asked += 1
         begun = self.look()
-        while self.told["status"] != "arrived" and self.look() < min(begun + PATIENCE, until):
+        while self.told["time_s"] < min(begun + PATIENCE, until):
+            truth = self.pair.later() if self.told["status"] == "arrived" else None
+            self.look()
+            if truth is not None and self.told["status"] == "arrived":  # and was not pushed away meanwhile
+                self.reached += math.dist(truth.tip, goal) < TOLERANCE
+                self.late += math.dist(truth.tip, goal) >= TOLERANCE
+                return
             time.sleep(0.02)
-        if self.told["status"] == "arrived":
-            truth = self.pair.later()
-            self.reached += math.dist(truth.tip, goal) < TOLERANCE
-            self.late += math.dist(truth.tip, goal) >= TOLERANCE
-        elif self.told["time_s"] < until:
-            self.late += 1
+        self.late += self.told["time_s"] < until
 
     def sample(self) -> Sample:
         """Take a minute's account; the log's closed segments are read whole, and deleted."""
