@@ -19,7 +19,7 @@ PUBLISHED = (
         "curobo.org: Benchmarks & Profiling, November 2024",
     ),
     (
-        "VAMP's RRT-Connect, one core with AVX2",
+        "VAMP's RRT-Connect, one core of a desktop PC",
         "Panda's",
         "-",
         "median 35 us",
