@@ -1,5 +1,6 @@
 """Compiled kernels are kept by what they are made of: told from numba's own counts of what it loaded and compiled."""
 
+import ast
 import json
 import os
 import subprocess
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rtctl.app import warm
 from rtctl.kernel.cache import VERSIONS, stamp
 from tests.test_architecture import ROOT, imports, modules
 
@@ -23,6 +25,7 @@ RECORD = (
     "@kernel\ndef y_of(s):\n    return inner(s)\n"
 )
 RUN = """
+import ast
 import json
 import numpy as np
 from lab.low import low
@@ -157,3 +160,10 @@ def test_two_processes_share_the_work(lab: Path) -> None:
     assert [values for values, _ in told] == [[3.0, 2.0, -1.0, 5.0]] * 2
     folders = lab.parent / "cache" / "rtctl"
     assert len(list(folders.glob("lab.*/*/*.nbi"))) == len(list(folders.glob("lab.*/*/*.nbc"))) == 5
+
+
+def test_as_many_kernels_are_announced_as_there_are_decorated_functions():
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "rtctl").rglob("*.py")]
+    functions = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    names = [d.id for function in functions for d in function.decorator_list if isinstance(d, ast.Name)]
+    assert warm.kernels() == sum(name.endswith("kernel") for name in names)

@@ -23,7 +23,7 @@ from rtctl.spec.base import is_base
 POLL = 0.25  # [s] between two looks at what was compiled: a look takes time from the compilers
 KEPT = 50  # marks of what was warmed
 _ROOT = Path(__file__).resolve().parents[1]
-_KERNEL = re.compile(rb"^@(?:ieee_)?kernel\b", re.MULTILINE)
+_KERNEL = re.compile(rb"^@(?:ieee_|leaf_)?kernel\b", re.MULTILINE)
 
 
 def needed(config: str | Path) -> bool:
