@@ -68,6 +68,27 @@ def test_compiled_kinematics_are_pinocchio_s():
         )
 
 
+def test_a_goal_that_only_a_folded_elbow_reaches_has_a_posture_though_it_lies_in_the_limit_s_zone():
+    arm = robot()
+    model, data = arm.body.model, arm.body.model.createData()
+    folded = np.array([2.3, 0.485, -1.904, arm.q_min[3] + 0.006, -0.033, 1.868, 2.382])  # the wrist as near as it comes
+    frame = model.getFrameId("panda_hand_tcp")
+    pin.forwardKinematics(model, data, folded)
+    there = pin.updateFramePlacement(model, data, frame)
+    goal = Goal(there.translation.copy(), quat_of(there.rotation), Task.POSE, 0.003, 0.015)
+    guide = Guide(arm, plans=False)
+    site = site_of(arm, around(), np.array(HOME))
+    assert endings(site, goal, 0) == []
+    found = guide._endings(site, goal)
+    assert found
+    for end in found:
+        assert ((end.q > arm.q_min) & (end.q < arm.q_max)).all()
+        pin.forwardKinematics(model, data, end.q)
+        reached = pin.updateFramePlacement(model, data, frame)
+        assert np.linalg.norm(reached.translation - there.translation) < 0.003
+        assert np.linalg.norm(pin.log3(reached.rotation.T @ there.rotation)) < 0.015
+
+
 def test_postures_of_a_goal_have_it_within_limits_and_clear():
     arm = robot()
     goal = Goal(np.array([0.5, 0.1, 0.3]), np.array(DOWN), Task.POSE, 0.003, 0.015)
