@@ -111,10 +111,11 @@ def _obstacles(g: Gathered) -> list[str]:
     return [*measured, *(way.name for way in g.obstacles if way.name not in measured)]
 
 
-def _line(axes: Axes, g: Gathered, name: str, scale: float = 1.0, **how: Any) -> None:
-    """Draw a series as a line through the smallest and largest value of each bin."""
+def _line(axes: Axes, g: Gathered, name: str, scale: float = 1.0, most: float = np.inf, **how: Any) -> None:
+    """Draw a series as a line through the smallest and largest value of each bin; what is beyond `most` is left out."""
     low, high = g.bins.series(name)
     time, values = np.repeat(g.bins.time, 2), scale * np.stack([low, high], axis=1).reshape(-1)
+    values = np.where(values > most, np.nan, values)
     axes.plot(time, values, **{"lw": 1.4, **how})
 
 
@@ -153,18 +154,21 @@ def _clearance(axes: Axes, g: Gathered, notes: Notes) -> None:
     """Draw the controller's distance to each obstacle; the oracle's smallest is told beside it."""
     oracle = dict(notes.oracle)
     names = [name.removeprefix("rho.") for name in g.bins.names if name.startswith("rho.")]
+    influence, clearance = _avoid(g)
+    edge = 3.0 * influence if influence > 0.0 else 0.6  # [m] what is farther would run through the names
     for name, colour in zip(names, cycle(OBSTACLE_COLOURS), strict=False):
         least = float(np.nanmin(g.bins.series(f"rho.{name}")[0])) * 1e3
         truth = f", oracle {oracle[name] * 1e3:.0f} mm" if name in oracle else ""
-        _line(axes, g, f"rho.{name}", color=colour, label=f"{name}: least {least:.0f} mm{truth}")
-    influence, clearance = _avoid(g)
+        _line(axes, g, f"rho.{name}", most=edge, color=colour, label=f"{name}: least {least:.0f} mm{truth}")
     if influence > 0.0:
         axes.axhspan(0.0, clearance, color=RED, alpha=0.12, lw=0)
         level(axes, influence, "influence", FAINT)
         level(axes, clearance, "clearance", RED)
-    axes.set_ylim(0.0, 5.0 * influence if influence > 0.0 else 0.6)
+    named = 0 < len(names) <= 12
+    axes.set_ylim(0.0, edge * (1.0 + 0.28 * ((len(names) + 1) // 2) * named))
+    axes.set_yticks(np.linspace(0.0, edge, 4))
     head(axes, "Clearance by the controller's spheres", "m")
-    if 0 < len(names) <= 12:
+    if named:
         axes.legend(loc="upper right", ncols=2, fontsize=9, framealpha=0.85, edgecolor="none", handlelength=1.4)
 
 
