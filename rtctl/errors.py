@@ -77,6 +77,7 @@ EXTRAS = {  # modules that the core does without, and the extra of the package t
     "pymavlink": "rover",
     "viser": "view",
     "trimesh": "view",
+    "foxglove": "view",
     "distributed": "campaign",
     "dask": "campaign",
 }

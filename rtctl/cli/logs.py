@@ -2,18 +2,21 @@
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtctl.cli import identify, pictures, replays
-from rtctl.cli.parser import Commands, Parser, command, log_file, positive
+from rtctl.cli.parser import Commands, Parser, command, log_file, port, positive
 from rtctl.cli.progress import bar
 from rtctl.cli.values import table
-from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError
+from rtctl.errors import EXIT_FAILED, EXIT_OK, UsageError, needs
 from rtctl.plain import Json
 
 if TYPE_CHECKING:
+    from rtctl.cli.relay import Relay
+    from rtctl.log.read.follow import Tail
     from rtctl.types import RecordRow
 
 
@@ -64,20 +67,23 @@ def add(commands: Commands) -> None:
         _mavlink,
     )
     _file(mavlink)
-    tail = command(
-        actions, "tail", "follow a log while it is written", "rtctl log tail\n  rtctl log tail logs/ --json", _tail
-    )
+    tail = command(actions, "tail", "follow a log while it is written", TAIL_EXAMPLE, _tail)
     tail.add_argument(
         "path", metavar="FILE|FOLDER", type=log_file, nargs="?", default="logs", help="default: the newest in logs/"
     )
     tail.add_argument("--json", action="store_true", help="print a JSON object a line")
     tail.add_argument("--every", metavar="S", type=positive, default=1.0, help="between two states (%(default)s s)")
     tail.add_argument("--for", dest="seconds", metavar="S", type=positive, default=float("inf"), help="then stop")
+    tail.add_argument("--foxglove", action="store_true", help="let Foxglove draw it: links, obstacles, goal, events")
+    tail.add_argument("--host", metavar="H", default="127.0.0.1", help="of --foxglove (%(default)s)")
+    tail.add_argument("--port", metavar="P", type=port, default=8765, help="of --foxglove; 0: any free (%(default)s)")
     pictures.add(actions)
     replays.add(actions)
     identify.add(actions)
 
 
+LOOK = 0.1  # [s] between two looks at a growing file
+TAIL_EXAMPLE = "rtctl log tail\n  rtctl log tail logs/ --json\n  rtctl log tail --foxglove"
 RECOVER_EXAMPLE = "rtctl log recover logs/\n  rtctl log recover cut.mcap --out whole.mcap"
 RECOVER_TEXT = """Make logs whole that a crash cut off, and empty the rings it left in /dev/shm.
 
@@ -241,22 +247,43 @@ def _tail(arguments: argparse.Namespace) -> int:
     from rtctl.log.read.follow import Tail, newest
 
     path = Path(arguments.path)
-    followed = Tail(newest(path) if path.is_dir() else path)
+    path = newest(path) if path.is_dir() else path
+    if not arguments.foxglove:
+        return _follow(arguments, Tail(path), None)
+    needs("view", "foxglove")
+    from rtctl.cli.relay import TOPICS, Relay
+
+    followed = Tail(path, TOPICS)
+    relay = Relay(followed, arguments.host, arguments.port)
+    try:
+        print(f"rtctl: {relay.url}: in Foxglove, Open connection, Foxglove WebSocket  (Ctrl-C ends)", file=sys.stderr)
+        return _follow(arguments, followed, relay)
+    finally:
+        relay.close()
+
+
+def _follow(arguments: argparse.Namespace, followed: "Tail", relay: "Relay | None") -> int:
+    from rtctl.cli.relay import pause
+
     until = time.monotonic() + arguments.seconds
     shown = -1e9
     while True:
         new = followed.read_on()
+        if relay is not None:
+            relay.add(new.messages)
         for event in new.events:
             _say(event, arguments.json)
         if len(new.ticks) and float(new.ticks["time"][-1]) - shown >= arguments.every:
             shown = float(new.ticks["time"][-1])
             print(json.dumps(_state(new.ticks[-1])) if arguments.json else _line(new.ticks[-1]), flush=True)
         if new.ended:
+            while relay is not None and relay.waits:
+                pause(relay, LOOK)
             print(json.dumps({"ended": new.ended}) if arguments.json else f"ended: {new.ended.get('reason', '?')}")
             return EXIT_OK
         if time.monotonic() > until:
             return EXIT_OK
-        time.sleep(0.1)
+        pause(relay, LOOK)
 
 
 def _say(event: Json, as_json: bool) -> None:

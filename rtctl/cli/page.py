@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rtctl.cli.parser import Commands, Parser, command, log_file
+from rtctl.cli.parser import Commands, Parser, command, log_file, port
 from rtctl.errors import EXIT_OK, RtctlError, UsageError, needs
 
 if TYPE_CHECKING:
@@ -47,14 +47,8 @@ def add(commands: Commands) -> None:
 def add_address(parser: Parser) -> None:
     """Add where the page listens."""
     parser.add_argument("--host", metavar="H", default="127.0.0.1", help="of the page (%(default)s)")
-    parser.add_argument("--port", metavar="P", type=_port, default=8080, help="of the page; 0: any free (%(default)s)")
+    parser.add_argument("--port", metavar="P", type=port, default=8080, help="of the page; 0: any free (%(default)s)")
     parser.add_argument("--no-browser", action="store_true", help="print the address alone")
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"got {text!r}, wanted a port of 0 to 65535")
-    return int(text)
 
 
 def _view(arguments: argparse.Namespace) -> int:

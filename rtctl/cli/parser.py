@@ -160,3 +160,10 @@ def positive(text: str) -> float:
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f"got {text!r}, wanted a number above 0")
     return value
+
+
+def port(text: str) -> int:
+    """Return a TCP port; 0 is any free one."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"got {text!r}, wanted a port of 0 to 65535")
+    return int(text)
