@@ -3,6 +3,7 @@
     python -m tools.contacts --hours 1                 # of simulated time, shared by the five arms
     python -m tools.contacts --hours 0.2 --arms panda --seed 7
     python -m tools.contacts --hours 0.1 --push 15     # with a push [N] at the forearm instead: is it noticed?
+    python -m tools.contacts --hours 0.1 --ratio 0.05  # with another collision_ratio than the file's
 
 Each run draws a payload up to the file's payload_max_kg, its centre within 5 cm of the tip, and Coulomb friction of
 each joint up to friction_ratio of its tau_max: the bounds that the file declares. Exit code 1 when any run without a
@@ -12,6 +13,7 @@ push says `collision`.
 import argparse
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import msgspec
@@ -19,6 +21,7 @@ import numpy as np
 
 from rtctl import design
 from rtctl.app.sim import simulate_scenario
+from rtctl.campaign.robots import Variant, text_of
 from rtctl.spec.plant import PlantTable
 from rtctl.spec.robot import Config
 from rtctl.spec.scenario import FaultTable, Scenario, load_scenario
@@ -74,9 +77,8 @@ def pushed(arm: str, scenario: Scenario, newton: float, rng: np.random.Generator
     return FaultTable(at_s=at, kind="push", duration_s=PUSH_TIME, link=FOREARMS[arm], newton=newton, direction=way)
 
 
-def counted(arm: str, seconds: float, seed: int, newton: float) -> Counted:
-    """Return what runs of an arm come to until so many seconds are played; told as they end."""
-    where = ROOT / "configs" / f"{arm}.toml"
+def counted(arm: str, where: Path, seconds: float, seed: int, newton: float) -> Counted:
+    """Return what runs of an arm, its file at `where`, come to until so many seconds are played; told as they end."""
     source = ROOT / "configs" / f"{SCENARIOS[arm]}.toml"
     config, scenario, rng = design.load(where), load_scenario(source), np.random.default_rng(seed)
     runs, played, collisions, other, delays = 0, 0.0, [], [], []
@@ -105,6 +107,16 @@ def counted(arm: str, seconds: float, seed: int, newton: float) -> Counted:
     return Counted(arm, runs, played, collisions, other, delays)
 
 
+def file_of(arm: str, ratio: float | None, folder: Path) -> Path:
+    """Return an arm's file, or one beside it in which `collision_ratio` is another."""
+    plain = ROOT / "configs" / f"{arm}.toml"
+    if ratio is None:
+        return plain
+    file = folder / plain.name
+    file.write_text(text_of(plain, Variant("", {("safety", "collision_ratio"): ratio})), encoding="utf-8")
+    return file
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Play and count; exit code 1 when an arm that nobody touched said `collision`."""
     parser = argparse.ArgumentParser(
@@ -114,9 +126,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--arms", nargs="+", choices=sorted(SCENARIOS), default=list(SCENARIOS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--push", type=float, default=0.0, metavar="N", help="push the forearm while it moves")
+    parser.add_argument("--ratio", type=float, metavar="R", help="collision_ratio of every arm; default: its file's")
     chosen = parser.parse_args(arguments)
     share = 3600.0 * chosen.hours / len(chosen.arms)
-    found = [counted(arm, share, chosen.seed, chosen.push) for arm in chosen.arms]
+    with TemporaryDirectory() as folder:
+        files = {arm: file_of(arm, chosen.ratio, Path(folder)) for arm in chosen.arms}
+        found = [counted(arm, file, share, chosen.seed, chosen.push) for arm, file in files.items()]
     for c in found:
         line = f"{c.arm:8} {c.runs:4} runs {c.seconds:7.0f} s  "
         if chosen.push > 0.0:
