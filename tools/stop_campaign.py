@@ -93,11 +93,11 @@ class Stops:
         return Scene(table, known.path)
 
     def play(self, case: Case, scene: Scene, config: Path) -> Json:
-        """Return the columns of a run; where anything was touched, the same is played without its fault."""
+        """Return the columns of a run; touched or gone on, the same is played without its fault to compare with."""
         fault = scene.table["fault"][0]
         course, digest = self._course(case, scene, fault["at_s"])
         alone = None
-        if course.contacts:
+        if course.contacts or not course.rows:
             alone, _ = self._course(case, scene._replace(table={**scene.table, "fault": []}), fault["at_s"])
         run = judged(
             ready(case.robot, case.config).setup.build(),
@@ -139,9 +139,8 @@ class _Kept:
 def _bare(arm: str) -> str:
     """Return the file's text of an arm without its brakes."""
     path = ROOT / "configs" / f"{arm}.toml"
-    drives = tomllib.loads(path.read_text(encoding="utf-8")).get("drives", ())
-    without: dict[tuple[str, ...], object] = {("drives", name, "brake"): False for name in drives}
-    return text_of(path, Variant("", without)).replace("brake = true", "brake = false")
+    joints = tomllib.loads(path.read_text(encoding="utf-8"))["robot"]["joints"]
+    return text_of(path, Variant("", {("robot", "joints"): [{**joint, "brake": False} for joint in joints]}))
 
 
 def rows_of(cases: Iterator[Case]) -> Iterator[Json]:
@@ -152,26 +151,30 @@ def rows_of(cases: Iterator[Case]) -> Iterator[Json]:
         yield row
 
 
-def table(rows: Sequence[Json]) -> list[str]:
-    """Return the worst of each fault and kind of brakes, as Markdown."""
+def table(rows: Sequence[Json], by: str) -> list[str]:
+    """Return the worst of each kind of brakes and fault, or arm, as Markdown; by: "fault" or "arm"."""
     out = [
-        "| fault | brakes | runs | noticed | faster [rad/s] | way [m] | past a limit [rad] | contacts "
+        f"| {by} | brakes | runs | noticed | faster [rad/s] | way [m] | past a limit [rad] | contacts "
         "| held [rad/s] | lowered [m/s] | of a free fall | beyond a bound |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    runs = [(row["number"], Run(**json.loads(row["detail"]))) for row in rows if row["outcome"] != "error"]
-    for kind in KINDS:
+    runs = [(row, Run(**json.loads(row["detail"]))) for row in rows if row["outcome"] != "error"]
+    for name in KINDS if by == "fault" else (*ARMS, *BARE.values()):
         for brakes in BRAKES:
-            these = [(number, run) for number, run in runs if (run.kind, run.brakes) == (kind, brakes)]
+            these = [
+                (row["number"], run)
+                for row, run in runs
+                if (run.kind if by == "fault" else row["robot"], run.brakes) == (name, brakes)
+            ]
             if not these:
                 continue
-            most = [max(getattr(r, name) for _, r in these) for name in ("faster", "way", "beyond", "contacts")]
-            bare = [max(getattr(r, name) for _, r in these) for name in ("held", "sinks", "falls")]
+            most = [max(getattr(r, column) for _, r in these) for column in ("faster", "way", "beyond", "contacts")]
+            bare = [max(getattr(r, column) for _, r in these) for column in ("held", "sinks", "falls")]
             figures = f"{most[0]:.2f} | {most[1]:.3f} | {most[2]:.3f} | {most[3]}"
             figures += f" | {bare[0]:.2f} | {bare[1]:.3f} | {bare[2]:.2f}" if brakes == "none" else " | | |"
             noticed = sum(run.noticed is not None for _, run in these)
             bad = " ".join(str(number) for number, run in these if run.broken)
-            out.append(f"| {kind} | {brakes} | {len(these)} | {noticed} | {figures} | {bad} |")
+            out.append(f"| {name} | {brakes} | {len(these)} | {noticed} | {figures} | {bad} |")
     return out
 
 
@@ -198,7 +201,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     else:
         todo = plan(args.runs, args.seed, args.robots, args.brakes).cases()
         rows = list(rows_of(c for c in todo if args.only is None or c.number in args.only))
-    print("\n".join(table(rows)))
+    for by in ("arm", "fault"):
+        print("\n".join(table(rows, by)), end="\n\n")
     broken = [row for row in rows if row["failures"]]
     for row in broken:
         print(f"{row['number']}: {row['robot']}, {row['set']}: {row['failures']}")

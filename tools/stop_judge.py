@@ -14,6 +14,7 @@ FALLS = frozenset(
     ("drive_fault", "overheat", "watchdog", "corrupt_command", "stuck_encoder", "false_velocity", "reboot")
 )
 SILENCE = 0xD  # what a drive says that has heard nothing for too long
+ASTRAY = 0.05  # [m] of the tip of an arm that goes on, from where it is at that time without the fault
 KNOCK = 5e-3  # [s] after the brakes close, in which one that holds a heavy joint throws the lighter ones
 FASTER = 0.3  # [rad/s] above the speed at the detection
 WAY = {"ideal": 0.05, "slipping": 0.10, "none": math.inf}  # [m] of the tip from the detection on; none: lowered
@@ -30,7 +31,7 @@ class Run(NamedTuple):
     kind: str
     joint: int
     at: float  # [s]
-    noticed: float | None  # [s] from the fault until the arm left RUN, None: it did not
+    noticed: float | None  # [s] from the fault until the arm left RUN, None: it did not; then, below, see `astray`
     faster: float = 0.0  # [rad/s] of any joint above its speed then, but for the knock of the brakes
     way: float = 0.0  # [m] of the tip from then on
     beyond: float = 0.0  # [rad] past a joint limit
@@ -42,36 +43,41 @@ class Run(NamedTuple):
     @property
     def broken(self) -> tuple[str, ...]:
         """The bounds that it breaks."""
+        way, faster = WAY[self.brakes], FASTER if self.brakes != "none" else math.inf
         if self.noticed is None:
-            return ()
+            way, faster = ASTRAY, 0.0
         bounds = (
             ("past a limit", self.beyond, 0.0),
             ("contacts", self.contacts, 0.0),
             ("held", self.held, FASTER),
             ("lowered", self.sinks, LOWERED),
             ("of a free fall", self.falls, 1.0),
-            ("faster", self.faster if self.brakes != "none" else 0.0, FASTER),
-            ("way", self.way, WAY[self.brakes]),
+            ("faster", self.faster, faster),
+            ("way", self.way, way),
         )
         return tuple(f"{name} {value:.3g}" for name, value, bound in bounds if not value <= bound)
 
 
 class Course:
-    """Watches a run: what is true in each period from the detection on."""
+    """Watches a run: what is true in each period from the fault, and from its detection on."""
 
     def __init__(self, fault: float) -> None:
         """fault [s]: before it nothing is looked at."""
         self.fault, self.closed, self.tripped = fault, math.inf, math.inf
+        self.going: list[Truth] = []  # until the detection
         self.rows: list[Truth] = []
         self.contacts = 0
 
     def __call__(self, servo: Any, truth: Truth, turn: Any) -> None:
         """Take a period into account."""
         self.contacts = truth.contacts
-        if not self.rows and (truth.time < self.fault or servo.memory.state == State.RUN):
+        if truth.time < self.fault:
             return
-        copied = {name: getattr(truth, name).copy() for name in ("q", "qd", "tip")}
-        self.rows.append(truth._replace(**copied))
+        copied = truth._replace(**{name: getattr(truth, name).copy() for name in ("q", "qd", "tip")})
+        if not self.rows and servo.memory.state == State.RUN:
+            self.going.append(copied)
+            return
+        self.rows.append(copied)
         if turn.command.drive == Drive.DISABLE:
             self.closed = min(self.closed, truth.time)
 
@@ -88,10 +94,15 @@ class Course:
 
 
 def judged(robot: Robot, course: Course, alone: Course | None, fault: tuple[str, int, float], brakes: str) -> Run:
-    """Return what came of a run; alone: the course of the same without the fault, fault: kind, joint, time [s]."""
+    """Return what came of a run; fault: kind, joint, time [s].
+
+    alone: the course of the same without the fault, wanted where anything was touched or the arm went on.
+    """
     kind, joint, at = fault
     if not course.rows:
-        return Run(brakes, kind, joint, at, None)
+        if alone is None:
+            raise ValueError("an arm that goes on is compared with the run without the fault: got none")
+        return astray(robot, course, alone, Run(brakes, kind, joint, at, None))
     t, q, qd, tip = (np.array([getattr(row, name) for row in course.rows]) for name in ("time", "q", "qd", "tip"))
     lost = np.array([brakes == "none" and kind in FALLS and joint in (-1, j) for j in range(robot.n)])
     lands = _lands(robot, q, lost)
@@ -120,6 +131,24 @@ def judged(robot: Robot, course: Course, alone: Course | None, fault: tuple[str,
         held=_held(t[:lands], qd[:lands, ~lost]),
         sinks=float(speed[late].max()) if not lost.any() and late.any() else 0.0,
         falls=_falls(robot, t[:lands], q[:lands], qd, int(lost.argmax())) if lost.sum() == 1 else 0.0,
+    )
+
+
+def astray(robot: Robot, course: Course, alone: Course, run: Run) -> Run:
+    """Return the run of an arm that went on with a fault.
+
+    It is under control, so its joints may be as fast as they may ever be; the tip is where the same arm without the
+    fault is at that time.
+    """
+    rows = min(len(course.going), len(alone.going))
+    q, qd, tip = (np.array([getattr(row, name) for row in course.going[:rows]]) for name in ("q", "qd", "tip"))
+    tip_alone = np.array([row.tip for row in alone.going[:rows]])
+    beyond = np.maximum(robot.q_min - q, q - robot.q_max)
+    return run._replace(
+        faster=max(0.0, float((np.abs(qd) - robot.qd_max).max())),
+        way=float(np.linalg.norm(tip - tip_alone, axis=1).max()),
+        beyond=max(0.0, float(beyond.max())),
+        contacts=max(0, course.contacts - alone.contacts),
     )
 
 
