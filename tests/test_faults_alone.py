@@ -64,6 +64,7 @@ BY_EVIDENCE: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     ("drive_fault", {"flags": detection.FAULT}, {"flags": detection.DISABLED}),
     ("encoder_stuck", {"flags": detection.STUCK}, {"flags": detection.STIRS}),
     ("velocity_mismatch", {"flags": detection.DISAGREE}, {"flags": detection.TORQUE}),
+    ("innovation", {"flags": detection.UNEXPLAINED}, {"flags": detection.TOUCHED}),
     ("not_finite", {"flags": detection.NOT_FINITE}, {"flags": detection.BEYOND}),
     ("not_finite", {"not_finite": True}, {"not_finite": False}),
     ("deadline", {"missed": 10}, {"missed": 9}),

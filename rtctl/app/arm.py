@@ -120,6 +120,8 @@ def unheld(robot: Robot, before: Memory, after: Memory, feedback: Feedback) -> l
         elif after.no_position & ~before.no_position & 1 << i and not after.no_speed & 1 << i:
             most = robot.stop.kd[i] * SLOW
             found.append(("cannot_hold", f"{joint}: damped alone, which carries {most:.2g} Nm at {SLOW:g} rad/s"))
+        elif not before.own_phase and not after.own_kd[i] > 0.0:
+            found.append(("cannot_hold", f"{joint}: its encoder may be stuck; held as soon as it moves"))
         elif not before.own_phase and feedback.replies[i] == 0:
             found.append(("cannot_hold", f"{joint}: is silent; whether its drive holds it is not known"))
     return found

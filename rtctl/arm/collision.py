@@ -7,6 +7,10 @@ T-RO 33(6), 2017). What is told of nobody may change fast for three reasons: spe
 and with it a payload up to the declared one; a joint turns round, and friction up to the declared one changes sign.
 While a joint is slow enough to stick, its track follows at once and its bound is twice that friction.
 
+A joint whose encoder is stuck may be driven off, too slowly for its own torque to tell, while friction might as well
+hold it. It shakes the others: what they feel is taken for a lie at a part of the bound already, where some encoder
+repeats itself while another joint slides. A contact that is taken for it is no worse for a stop that trusts nothing.
+
 A force on a link turns no joint beyond it: the last joint that feels it carries the link that was touched (De Luca,
 Albu-Schaeffer, Haddadin and Hirzinger 2006). m, c: as in `sensing`.
 """
@@ -16,6 +20,7 @@ import math
 import numpy as np
 
 from rtctl.arm.disturbance import BANDWIDTH, GRAVITY, LASTING, PAYLOAD_REACH, spread
+from rtctl.arm.encoders import EQUAL, STUCK_TIME
 from rtctl.arm.model import Model
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
@@ -31,7 +36,8 @@ CONFIRMED = 3  # ticks
 LEVER = 0.1  # [m] of all joints together, below which a weight at the tip is not felt
 HIDDEN, SLIGHT = 1.5, 3.0  # times the weight that is felt, and [N] beside it
 FELT = 0.5  # of its bound: so much of the torque counts as felt by a joint
-NO, TOUCHED, STRUCK = 0, 1, 2  # what a tick shows
+SUSPECT = 0.25  # of the level of a contact, while an encoder may be stuck
+NO, TOUCHED, STRUCK, UNEXPLAINED = 0, 1, 2, 3  # what a tick shows
 _RUN = int(State.RUN)
 
 
@@ -112,12 +118,22 @@ def _bounds(c: RecordRow, m: RecordRow, model: Model, elapsed: float) -> F64:
 
 
 @kernel
+def _repeats(m: RecordRow, n: int) -> bool:
+    """Return whether the encoder of some joint may be stuck: it repeats itself while another joint slides."""
+    repeats, slides = False, False
+    for i in range(n):
+        repeats = repeats or m.encoder_monitors[EQUAL, i] >= STUCK_TIME
+        slides = slides or m.steady[i] >= STEADY
+    return repeats and slides
+
+
+@kernel
 def watch_contact(c: RecordRow, m: RecordRow, qd: F64, model: Model, elapsed: float) -> None:
     """Look for a contact in the external torque of this tick; qd (n,) [rad/s] as measured."""
     n = qd.shape[0]
     begins = m.state == _RUN and (m.tick - m.since) * c.dt < BEGIN
     fast, bound = np.empty(n), _bounds(c, m, model, elapsed)
-    touched, struck = False, False
+    touched, struck, suspect = False, False, False
     for i in range(n):
         m.steady[i] = m.steady[i] + elapsed if abs(qd[i]) > MOVING else 0.0
         rate = LASTING if begins or m.steady[i] < STEADY else TRACKING
@@ -125,11 +141,16 @@ def watch_contact(c: RecordRow, m: RecordRow, qd: F64, model: Model, elapsed: fl
         m.track[i] += (1.0 - math.exp(-rate * elapsed)) * fast[i]
         touched = touched or abs(fast[i]) > c.collision[i] + bound[i]
         struck = struck or abs(fast[i]) > c.collision_hard[i] + bound[i]
-    touched = touched and m.state == _RUN
-    if begins or m.floating != 0 or not (touched or struck):  # a hand is expected
+        suspect = suspect or abs(fast[i]) > SUSPECT * c.collision[i] + bound[i]
+    touched, suspect = touched and m.state == _RUN, suspect and m.state == _RUN and _repeats(m, n)
+    if begins or m.floating != 0 or not (touched or struck or suspect):  # a hand is expected
         m.touches, m.contact_level = 0, NO
         return
-    m.touches = m.touches + 1
+    if not (touched or struck):
+        m.touches = min(m.touches, 0) - 1  # counted downwards
+        m.contact_level = UNEXPLAINED if m.touches <= -CONFIRMED else NO
+        return
+    m.touches = max(m.touches, 0) + 1
     if m.touches < CONFIRMED:
         return
     m.contact_level = STRUCK if struck else TOUCHED

@@ -25,7 +25,8 @@ from rtctl.types import B1, F64, Feedback
     GOAL_INSIDE,  # an obstacle around the goal's position
     TOUCHED,  # an external torque that nothing told explains
     STRUCK,  # the same, and large
-) = (1 << i for i in range(15))
+    UNEXPLAINED,  # the same, and small, while an encoder repeats itself
+) = (1 << i for i in range(16))
 
 
 class Clearances(NamedTuple):

@@ -56,10 +56,14 @@ def fresh(n: int) -> F64:
 
 
 @kernel
-def _moves(f: Feedback, q_previous: F64) -> bool:
-    """Return whether any joint moves by its position and by its speed."""
+def _moves(f: Feedback, q_previous: F64, equal: F64) -> bool:
+    """Return whether any joint moves by its position, within STUCK_TIME, and by its speed.
+
+    equal (n,) [s] for which each position had been the same: a slow joint takes some periods for a step of its encoder.
+    """
     for i in range(f.q.shape[0]):
-        if f.replies[i] > 0 and f.q[i] != q_previous[i] and abs(f.qd[i]) > STIRRED:
+        changes = f.q[i] != q_previous[i] or equal[i] < STUCK_TIME
+        if f.replies[i] > 0 and changes and abs(f.qd[i]) > STIRRED:
             return True
     return False
 
@@ -73,7 +77,7 @@ def monitor_encoders(
     before (5, n): the monitors of the last tick; dt [s] servo period.
     """
     w, elapsed = before.copy(), previous.elapsed
-    stuck, disagree, moves = False, False, _moves(f, previous.q)
+    stuck, disagree, moves = False, False, _moves(f, previous.q, before[EQUAL])
     for i in range(f.q.shape[0]):
         if f.replies[i] == 0:
             continue  # silence is a fault of its own

@@ -290,7 +290,7 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
         bits |= _B.outside_limits
     if active and flags & detection.FAST:
         bits |= _B.overspeed
-    if n.innovation >= 5:
+    if n.innovation >= 5 or flags & detection.UNEXPLAINED:
         bits |= _B.innovation
     if active and flags & (detection.TOUCHED | detection.STRUCK):
         bits |= _B.collision_hard if flags & detection.STRUCK else _B.collision

@@ -7,6 +7,10 @@ that fall (and damps, where the joint's speed is known). A joint whose encoder l
 position alone lies is damped, one of which nothing is true is let go, as is one whose drive has tripped. The others go
 on holding: they keep the rest from following.
 
+Where something was a surprise and nobody knows which joint it was, an encoder that has repeated itself since before may
+be stuck: held by what it says, its joint would be driven by the difference to it for ever. It is let go until it moves
+by its own account, which one that is true tells within a step of the encoder, and held from then on.
+
 When all rest, the arm is lowered down the slope of its potential energy, qd ~ -g(q), until gravity moves it no more,
 it lies on something, or its limits carry it; then kp and t fade, and torque is cut. m, c: as in `sensing`.
 """
@@ -15,7 +19,7 @@ import math
 
 import numpy as np
 
-from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, STUCK_TIME, STUCK_TRAVEL, TRAVEL
+from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, RESIDUAL, STUCK_TIME, STUCK_TRAVEL, TRAVEL
 from rtctl.arm.faults import BIT
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import Surroundings
@@ -35,11 +39,13 @@ SINK_RATE, SINK_TIME, SINK_LATEST = 1.0, 4.0, 12.0  # [1/s], [s] with which kp a
 NOTICE = 0.1  # [s] after the onset of a stop, in which a joint that was let go has not come to its end
 STEEPER = 2.0  # times the law's braking: a joint that comes near its limit comes to rest with more
 SWEEPS = 20  # of the joints that fall: how fast, of what the others do
+SPEED_LIE = 0.3  # [rad/s] by which a speed is untrue where something was a surprise: far beyond noise
 JUMP = 0.1  # [rad] from where the joint is held to be: the position is untrue, the speed need not be
 
 # numbers of the enumerations, as compiled code reads them
 _STOPPING, _SAFE_STOP = int(State.STOPPING), int(State.SAFE_STOP)
 _SS1, _CONTACT = int(Severity.SS1), BIT["contact"]
+_SURPRISES = BIT["innovation"] | BIT["collision_hard"]  # they do not say which joint's measurements lie, if any does
 
 
 @kernel
@@ -64,7 +70,10 @@ def _distrust(c: RecordRow, m: RecordRow, f: Feedback) -> None:
     for i in range(n):
         bit = 1 << i
         stuck = monitors[EQUAL, i] >= STUCK_TIME and abs(monitors[TRAVEL, i]) > STUCK_TRAVEL
-        if stuck or monitors[BEYOND, i] >= DISAGREE_TICKS:
+        lies = monitors[BEYOND, i] >= DISAGREE_TICKS
+        if m.in_force & _SURPRISES:  # it may have been this: a stop by such a speed cannot wait for all that evidence
+            lies = lies or abs(monitors[RESIDUAL, i]) > SPEED_LIE
+        if stuck or lies:
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
         if f.replies[i] > 0 and not (math.isfinite(f.q[i]) and math.isfinite(f.qd[i])):
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
@@ -80,6 +89,8 @@ def _begin(c: RecordRow, m: RecordRow, n: int) -> None:
     m.lost = 0
     for i in range(n):
         m.own_p[i] = min(max(m.own_p[i], c.q_min[i]), c.q_max[i])
+        if m.in_force & _SURPRISES and m.encoder_monitors[EQUAL, i] >= STUCK_TIME:
+            m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0
 
 
 @kernel
@@ -88,7 +99,7 @@ def _slope(c: RecordRow, m: RecordRow, model: Model, g: F64) -> F64:
     n, most = g.shape[0], 0.0
     u = np.zeros(n)
     for i in range(n):
-        tau, held = c.tau_max[i], not m.lost >> i & 1
+        tau, held = c.tau_max[i], not m.lost >> i & 1 and m.own_kd[i] > 0.0
         low, high = m.own_p[i] <= c.q_min[i] + AT_LIMIT, m.own_p[i] >= c.q_max[i] - AT_LIMIT
         lies = m.own_kp[i] * (m.q[i] - m.own_p[i]) * (1.0 if g[i] > 0.0 else -1.0) > PRESS * tau  # on something
         if held and abs(g[i]) > FLAT * tau and not (lies or (low and g[i] > 0.0) or (high and g[i] < 0.0)):
@@ -202,8 +213,8 @@ def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F6
 
 
 @kernel
-def _let_go(m: RecordRow, f: Feedback) -> None:
-    """Take the terms that are not to be trusted from the drives' loops; f: as it came."""
+def _let_go(c: RecordRow, m: RecordRow, f: Feedback) -> None:
+    """Take the terms that are not to be trusted from the drives' loops, and give back what was; f: as it came."""
     for i in range(f.q.shape[0]):
         bit, off = 1 << i, f.drive[i] != 1
         if off or m.no_speed & bit:
@@ -211,7 +222,10 @@ def _let_go(m: RecordRow, f: Feedback) -> None:
             m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0
             m.own_t[i] = 0.0 if off else m.own_t[i]
         elif m.no_position & bit:
-            m.own_kp[i], m.own_v[i] = 0.0, 0.0
+            m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, c.stop_kd[i], 0.0
+        elif m.own_kd[i] < c.stop_kd[i] and m.encoder_monitors[EQUAL, i] < STUCK_TIME and m.own_phase != SINKING:
+            m.own_kp[i], m.own_kd[i] = c.stop_kp[i], c.stop_kd[i]
+            m.own_p[i], m.own_v[i] = min(max(m.q[i], c.q_min[i]), c.q_max[i]), m.qd[i]
 
 
 @kernel
@@ -226,7 +240,7 @@ def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surr
     _distrust(c, m, f)
     if m.own_phase != SINKING:
         m.own_g[:n] = g
-    _let_go(m, f)
+    _let_go(c, m, f)
     qdd = -m.own_v[:n]
     _go_on(c, m, model, around, g)
     for i in range(n):
@@ -236,7 +250,7 @@ def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surr
     for i in range(n):
         step, heard = c.tau_rate[i] * c.dt, f.age[i] <= c.safety_lost_periods * c.dt
         t = m.own_g[i] + inertial[i]
-        if m.lost >> i & 1:
+        if m.own_kd[i] == 0.0:  # it is let go
             t = 0.0
         elif heard and f.replies[i] > 0 and not m.no_position >> i & 1:
             t -= c.stop_damping[i] * (m.qd[i] - m.own_v[i])

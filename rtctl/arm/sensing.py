@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.arm import collision
 from rtctl.arm.detection import (
     BEYOND,
     STIRS,
     STRUCK,
     TOUCHED,
+    UNEXPLAINED,
     Clearances,
     JointBounds,
     Tolerances,
@@ -250,7 +252,9 @@ def detect_faults(
     if active:
         monitors, more = _monitored(c, m, f, model)
         flags |= more
-    flags |= STRUCK if m.contact_level > 1 else TOUCHED if m.contact_level == 1 else 0
+    if m.contact_level != collision.NO:
+        flags |= UNEXPLAINED if m.contact_level == collision.UNEXPLAINED else TOUCHED
+        flags |= STRUCK if m.contact_level == collision.STRUCK else 0
     evidence = Evidence(
         flags,
         found.age,
