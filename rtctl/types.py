@@ -205,6 +205,7 @@ class Request(NamedTuple):
     payload: Payload | None = None
     advice: Advice | None = None
     grip: Grip | None = None
+    drive: tuple[float, ...] | None = None  # (n,) [Nm] of another law, in place of what drives the arm in this tick
 
 
 NO_GRIPPERS = np.zeros((5, 0))

@@ -269,4 +269,5 @@ ARM = Vehicle(
     rebuild=rebuild,
     checkpoints=Checkpoints(encode_checkpoint, decoded),
     keeps_step=True,
+    takes_law=True,
 )

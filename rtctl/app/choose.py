@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rtctl.app.vehicle import SomeVehicle
+from rtctl.errors import ConfigError
 from rtctl.spec.base import is_base
 
 
@@ -20,3 +21,9 @@ def vehicle_named(kind: str) -> SomeVehicle:
     from rtctl.app.arm import ARM  # nor the arm's model for a base
 
     return ARM
+
+
+def refuse_law(vehicle: SomeVehicle, where: Path) -> None:
+    """Raise ConfigError for a vehicle that takes no law but its own."""
+    if not vehicle.takes_law:
+        raise ConfigError(f"{where}: robot.kind", "base", "arm: a law of one's own gives joint torques")

@@ -12,7 +12,8 @@ from typing import Generic, NamedTuple, Protocol
 
 import numpy as np
 
-from rtctl.app.choose import vehicle_of
+from rtctl.app.choose import refuse_law, vehicle_of
+from rtctl.app.own_law import AnyLaw, load_law
 from rtctl.app.queue import GoalQueue
 from rtctl.app.servo import Servo
 from rtctl.app.vehicle import LOCKSTEP_SILENT, LOCKSTEP_WAIT, Advising, C, F, Loop, M, R, Say, Setup, Vehicle
@@ -60,6 +61,7 @@ def run(
     timeout: float | None = None,
     passing: Collection[int] = (),
     lobby: Lobby | None = None,
+    law: str = "",
 ) -> int:
     """Run the daemon of a config file until SIGTERM; return the exit code. Raises RtctlError for a refusal.
 
@@ -68,12 +70,18 @@ def run(
     timeout: [s] that the vehicle is waited for, in place of what the config says.
     passing: user ids whose hold on the bus does not count, see `InstanceLock`.
     lobby: who answers at the control socket already; by default that begins here.
+    law: FILE.py:NAME of a law of one's own for an arm, see `sim.simulate`; when it raises, the arm is stopped, and no
+    law but this program's is asked from then on.
     """
     path = Path(config_path)
     vehicle = vehicle_of(path)
+    if law:
+        refuse_law(vehicle, path)
     if lockstep and not vehicle.keeps_step:
         raise UsageError("--lockstep is for drives on a bus; `rtctl sim` plays a base in lockstep")
-    return _run(vehicle, vehicle.load(path, timeout), How(path, lockstep, dry, passing, lobby))
+    return _run(
+        vehicle, vehicle.load(path, timeout), How(path, lockstep, dry, passing, lobby, load_law(law) if law else None)
+    )
 
 
 class How(NamedTuple):
@@ -84,6 +92,7 @@ class How(NamedTuple):
     dry: bool
     passing: Collection[int]
     lobby: Lobby | None
+    law: AnyLaw | None
 
 
 def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> int:
@@ -108,6 +117,7 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         adviser = stack.enter_context(closing(vehicle.adviser(robot, lockstep)))  # a fork: the thread has ended
         recorder = _recorder(setup.log, header._replace(extra=told), how.path)
         servo = Servo(vehicle, robot, link, recorder, start, dry)
+        servo.law = how.law
         queue = GoalQueue()
         console.publish(
             lambda: {**status(servo, recorder), **queue.status()},

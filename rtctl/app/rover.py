@@ -209,4 +209,5 @@ ROVER = Vehicle(
     rebuild=rebuild,
     checkpoints=None,
     keeps_step=False,
+    takes_law=False,
 )

@@ -3,18 +3,20 @@
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from typing import Generic
+from typing import Generic, TypeAlias
 
+from rtctl.app.own_law import raised
 from rtctl.app.vehicle import C, Event, F, Link, M, R, Said, Sink, Turn, Vehicle
 from rtctl.hal.clock import Slot
 from rtctl.log.entry import Kind
 from rtctl.log.record import checkpoint
 from rtctl.log.record.health import Repeats
 from rtctl.log.record.requests import encode_event, encode_request
-from rtctl.types import Frames, Record, Request
+from rtctl.types import F64, Frames, Record, Request, Verb
 
 TICK, EVENT, REQUEST, CHECKPOINT = int(Kind.TICK), int(Kind.EVENT), int(Kind.REQUEST), int(Kind.CHECKPOINT)
 QUIET = Request()
+Law: TypeAlias = Callable[[R, M, F], Sequence[float] | F64 | None]  # a law of one's own; see `sim.simulate`
 
 
 class Servo(Generic[R, M, F, C]):
@@ -47,6 +49,8 @@ class Servo(Generic[R, M, F, C]):
         self.events: list[Said] = []  # newest last; (time [s], name, detail)
         self.lateness = 0.0  # [s] of this wake-up
         self.flags = 0  # types.Link bits that only the daemon knows
+        self.law: Law[R, M, F] | None = None  # drives the arm in place of this program's own
+        self.failure: Exception | None = None  # that it raised
 
     def turn(self, slot: Slot, request: Request) -> Turn[F, C]:
         """Read, decide, write, record."""
@@ -55,6 +59,8 @@ class Servo(Generic[R, M, F, C]):
         feedback = link.read(slot.slot, slot.missed, slot.lateness, self.compute)
         if self.flags:
             feedback = vehicle.flagged(feedback, self.flags)
+        if self.law is not None:
+            request = self._driven(self.law, feedback, request)
         self.memory, command, record = vehicle.tick(robot, before, feedback, request)
         frames = link.write(vehicle.harmless(command) if self.dry else command)
         self.digest.update(frames.data if type(frames) is Frames else b"".join(frames))
@@ -74,6 +80,16 @@ class Servo(Generic[R, M, F, C]):
         self._log(record, frames, request, events)
         self.compute = time.perf_counter() - begin
         return Turn(feedback, command, record, frames)
+
+    def _driven(self, law: Law[R, M, F], feedback: F, request: Request) -> Request:
+        """Return the request with the torque of another law; one that raised is never asked again: the arm stops."""
+        try:
+            tau = law(self.robot, self.memory, feedback)
+            return request if tau is None else request._replace(drive=tuple(map(float, tau)))
+        except Exception as error:
+            self.law, self.failure = None, error
+            self.notes.append(("law", raised(error)))
+            return request if request.verb else request._replace(verb=Verb.STOP)
 
     def _log(self, record: Record, frames: Sequence[bytes], request: Request, events: list[Event]) -> None:
         if self.sink is None:

@@ -11,8 +11,9 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from rtctl.app.choose import vehicle_of
+from rtctl.app.choose import refuse_law, vehicle_of
 from rtctl.app.live import Live
+from rtctl.app.own_law import AnyLaw, OwnLawError, raised
 from rtctl.app.servo import Servo
 from rtctl.app.tally import number
 from rtctl.app.vehicle import C, F, M, Play, R, Setup, Sink, Turn, Vehicle
@@ -22,6 +23,7 @@ from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, load_scenario, robot_file
 
 Watch: TypeAlias = Callable[[Any, Any, Any], None]  # is shown servo, truth and turn of the vehicle after each period
+RESTED = 0.1  # [s] at rest: then an arm whose law raised has been stopped
 Over: TypeAlias = Callable[[Any, float], bool]  # truth, and how long [s] the last goal has been kept
 
 
@@ -31,14 +33,30 @@ def simulate(
     realtime: bool = False,
     watch: Watch | None = None,
     shown: Callable[[Path], None] | None = None,
+    law: AnyLaw | None = None,
 ) -> Json:
     """Return the figures of a scenario file, played from its start to `duration_s`; write an MCAP log if asked.
 
     shown: people see it, in real time, and may command it; is told of the ring that viewers look into, and the scenario
     begins when it returns. When that is over the robot goes on, until a KeyboardInterrupt.
+
+    law: a law of one's own for an arm, law(robot, memory, feedback) in each tick, before it:
+
+        tau = law + what obstacles, the own links and joint limits push + h + g
+
+    It gives (n,) [Nm], or None for this program's own law. `memory` is what the last tick left: memory.joints.q, .qd
+    (n,), memory.tip.x (3,), memory.goal, memory.model.A (n, n), .J (6, n); `feedback` came from the drives just now.
+    Nothing of it is trusted. It is given no more acceleration than this program's own motion has ([motion] a_max,
+    alpha_max, and of joints what brakes them), and that within 20 ms. The guards hold its torque back where the arm
+    could not stop in time before a limit, an obstacle or a link of its own, or where a joint or the tip would be faster
+    than it may; magnitude and rate are limited. Gravity, what the arm carries and friction are given beside it. It acts
+    in RUN alone: a stop, a fault that brakes and parking are this program's. Its torques are in the log, and a replay
+    gives the same bits.
+
+    Raises OwnLawError when the law raises; the arm has been stopped then.
     """
     scenario = load_scenario(path)
-    return simulate_scenario(scenario, robot_file(scenario, path), Path(path), log, realtime, watch, shown)
+    return simulate_scenario(scenario, robot_file(scenario, path), Path(path), log, realtime, watch, shown, law)
 
 
 def simulate_scenario(
@@ -49,9 +67,15 @@ def simulate_scenario(
     realtime: bool = False,
     watch: Watch | None = None,
     shown: Callable[[Path], None] | None = None,
+    law: AnyLaw | None = None,
 ) -> Json:
-    """Return the figures of a scenario for the robot file `where`; paths in it are relative to the file `source`."""
+    """Return the figures of a scenario for the robot file `where`; paths in it are relative to the file `source`.
+
+    The rest as for `simulate`.
+    """
     vehicle = vehicle_of(where)
+    if law is not None:
+        refuse_law(vehicle, where)
     setup = vehicle.load(where, None)
     play = setup.simulate(scenario, source)
     robot, link = play.robot, play.link
@@ -72,6 +96,7 @@ def simulate_scenario(
             )
             sinks.append(live)
         servo = Servo(vehicle, robot, link, _sink(sinks), start, stamp=lambda now: round(now * 1e9))
+        servo.law = law
         if live is not None and shown is not None:
             live.serve(servo)
             shown(live.ring)
@@ -150,10 +175,14 @@ def _played(
         if watch is not None:
             watch(servo, play.truth, turn)
         ticks += 1
+        if servo.failure is not None and servo.memory.rest * dt >= RESTED:
+            break
         if live is not None:
             live.answer(servo.memory.refusal)
         if realtime or live is not None:
             time.sleep(max(0.0, begun + ticks * dt - time.monotonic()))
+    if servo.failure is not None:
+        raise OwnLawError(f"the law raised {raised(servo.failure)}; the arm was stopped") from servo.failure
     return ticks
 
 

@@ -233,6 +233,7 @@ class Vehicle(NamedTuple, Generic[R, M, F, C]):
     rebuild: Callable[[Run, Path | None], Rebuilt[R, F, C]]  # a log, another config for it
     checkpoints: Checkpoints[R, M] | None  # None: a log is replayed from its beginning alone
     keeps_step: bool  # its simulated drives can be run in lockstep over the bus
+    takes_law: bool  # a law of somebody's own may drive it
 
 
 SomeVehicle: TypeAlias = Vehicle[Any, Any, Any, Any]  # chosen by a file; its functions fit one another

@@ -160,7 +160,7 @@ class Motion(NamedTuple):
     q_rest: F64  # (n,) [rad] the posture
     speed_scale: float  # fraction of qd_max that joints may have
     qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
-    floats: bool  # a hand moves the arm: no motion, no posture
+    floats: bool  # a hand or another law moves the arm: no motion, no posture
     hand: F64  # (n,) [Nm] then
     ahead: Ahead
 

@@ -144,6 +144,10 @@ HOT = np.dtype(
             ("floating", _INT),
             ("float_weight", _REAL),  # [N] at the tip
             ("float_rest", _REAL, _JOINT),  # [Nm] that lasted beside it
+            # another law drives the arm
+            ("driven", _INT),  # in this tick
+            ("drive", _REAL, _JOINT),  # [Nm] that it asks for
+            ("drive_given", _REAL, _JOINT),  # [Nm] of that; zero in a tick without it
         ],
     )
 )
@@ -171,6 +175,8 @@ _JOINTS = (
     "expected",
     "steady",
     "float_rest",
+    "drive",
+    "drive_given",
     "sent",
     "encoder_monitors",
 )
@@ -187,6 +193,7 @@ _FLAGS = (
     "noticed",
     "settled",
     "floating",
+    "driven",
 )
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 

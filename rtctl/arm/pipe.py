@@ -4,6 +4,9 @@ Equal inputs give equal bits, which is what makes replay, lockstep simulation an
 block diagram is `tick`; each block is a function below it or a module beside it.
 """
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from rtctl.arm import diagnosis, escape
@@ -73,6 +76,8 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
     if request.obstacles:
         m, bits = _perceived(robot, memory, feedback, request), bits | WORLD
         refusal = m.refusal
+    if request.drive is not None:
+        m, refusal = _driven(robot, m, request.drive, refusal)
     arm, model, parameters, placed, shapes, ends = robot.arm, m.model, m.parameters, m.placed, m.shapes, m.ends
     bodies = placed.obstacles.mesh, placed.obstacles.clouds
     hot, table, raw, flags = servo(arm, m.hot, parameters, m.table, shapes, bodies, ends, f, asking(START, bits, verb))
@@ -102,6 +107,13 @@ def tick(robot: Robot, memory: Memory, feedback: Feedback, request: Request) -> 
         m, command, record = _gripped(robot, m, (feedback, request), command, record)
     record.flags.writeable = False
     return m, command, record
+
+
+def _driven(robot: Robot, m: Memory, drive: Sequence[float], refusal: str) -> tuple[Memory, str]:
+    """Return the memory of an arm that another law drives in this tick, and why its torque was refused."""
+    if len(drive) != robot.n or not all(map(math.isfinite, drive)):
+        return m, refusal or f"drive: got {drive}, wanted {robot.n} finite torques [Nm]"
+    return m._replace(driven=True, drive=np.array(drive, np.float64)), refusal
 
 
 def _command(drive: Drive, hot: F64, n: int) -> Command:

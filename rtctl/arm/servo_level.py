@@ -22,6 +22,7 @@ from rtctl.arm.loads import loaded, observe, pushed
 from rtctl.arm.memory import HOT, MEASURED_POSTURE
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
+from rtctl.arm.own_drive import let_drive
 from rtctl.arm.own_loop import given, holds_itself, own_loop
 from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
@@ -253,6 +254,10 @@ def _act(
     e, e_rot, q_rest = wanted(c, m, model, asked.bits & CHOSEN != 0)
     q, qd, x, R, xd, omega = m.q[:n].copy(), m.qd[:n].copy(), m.x.copy(), m.R.copy(), m.xd.copy(), m.omega.copy()
     carried, hand = pushed(c, m, space.Jbar, n)
+    m.drive_given[:n] = (
+        let_drive(c, model, m.drive_given[:n].copy(), m.drive[:n].copy()) if m.driven != 0 else np.zeros(n)
+    )
+    hand += m.drive_given[:n]
     at = loaded(model, carried, q if c.carry == 0.0 else model.q)  # without carrying, points have not moved either
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
@@ -273,7 +278,7 @@ def _act(
             q_rest,
             m.speed_scale,
             m.qdd[:n].copy(),
-            m.floating != 0,
+            m.floating != 0 or m.driven != 0,
             hand,
             ahead,
         ),
@@ -307,6 +312,7 @@ def _act(
         nearest,
         c.dt,
     )
+    m.driven = 0  # the other law is asked in each tick
     return raw, flags
 
 

@@ -76,7 +76,7 @@ def _braking(m: RecordRow) -> bool:
 @kernel
 def pursues(m: RecordRow) -> bool:
     """Return whether the tip is on its way to the goal."""
-    return bool(m.has_goal != 0 and m.state == _RUN and not _braking(m))
+    return bool(m.has_goal != 0 and m.state == _RUN and m.driven == 0 and not _braking(m))
 
 
 @kernel
@@ -173,9 +173,11 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
     )
     slow = braking and greater(_largest_size(m.v_ref), _largest_size(m.w_ref)) < SLOW_REFERENCE
     m.floating = 0 if braking or m.state != _RUN else m.floating
-    if m.floating != 0:
-        m.v_ref[:], m.w_ref[:] = m.xd, m.omega  # what follows begins with the speed that the hand gave
-    if (braking and not slow) or m.floating != 0:
+    m.driven = 0 if braking or m.state != _RUN or m.parking != 0 or m.outside != 0 else m.driven
+    guided = m.floating != 0 or m.driven != 0
+    if guided:
+        m.v_ref[:], m.w_ref[:] = m.xd, m.omega  # what follows begins with the speed that the hand or other law gave
+    if (braking and not slow) or guided:
         _hold_here(c, m)  # the hold begins where the braking ends
     target, R = target_of(m, pursuing), m.R.copy()
     e, e_rot = np.zeros(3), np.zeros(3)
@@ -256,6 +258,10 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
         _no_escape(m)
         m.still = m.still + 1
         return changed
+    if m.driven != 0:  # what holds the arm is then no matter of this law
+        m.still, m.nearest, m.stall_timer = 0, np.inf, 0.0
+        _no_escape(m)
+        return _take_status(m, _MOVING)
     if leads(m):
         before = _waited(c, m)
         m.still, m.nearest, m.stall_timer = 0, np.inf, max(0.0, m.stall_timer + (c.dt if _drags(m) else -2.0 * c.dt))

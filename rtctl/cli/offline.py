@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtctl.cli import page
-from rtctl.cli.parser import Commands, command, positive
+from rtctl.cli.parser import Commands, Parser, command, positive
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RtctlError, UsageError
 from rtctl.hal.say import ERR, say
 from rtctl.plain import Json
@@ -33,6 +33,7 @@ def add_before(commands: Commands) -> None:
     run.add_argument("--dry", action="store_true", help="compute and log, but send stop frames alone")
     run.add_argument("--lockstep", action="store_true", help="wait for the drives' replies instead of the clock")
     run.add_argument("--timeout", metavar="S", type=positive, help="wait no longer for a vehicle that is not there yet")
+    _add_law(run)
     run.add_argument(
         "--pass-lock-of",
         metavar="USER",
@@ -67,6 +68,7 @@ def add_after(commands: Commands) -> None:
         help="in the browser and in real time; it takes commands, and goes on after its end",
     )
     page.add_address(sim)
+    _add_law(sim)
     sim.add_argument(
         "--allow-miss", action="store_true", help="exit 0 also when a goal was missed or something touched"
     )
@@ -95,6 +97,12 @@ def add_after(commands: Commands) -> None:
         _completion,
     )
     completion.add_argument("shell", choices=("bash", "zsh", "fish"), metavar="SHELL", help="bash, zsh or fish")
+
+
+def _add_law(parser: Parser) -> None:
+    parser.add_argument(
+        "--law", metavar="FILE.py:NAME", default="", help="a law of your own drives the arm, within every guard"
+    )
 
 
 def _completion(arguments: argparse.Namespace) -> int:
@@ -135,6 +143,7 @@ def _run(arguments: argparse.Namespace) -> int:
             timeout=arguments.timeout,
             passing=passing,
             lobby=lobby,
+            law=arguments.law,
         )
 
 
@@ -189,14 +198,16 @@ def _stranger(name: str) -> int:
 
 
 def _sim(arguments: argparse.Namespace) -> int:
+    from rtctl.app.own_law import load_law
     from rtctl.app.sim import simulate
     from rtctl.spec.scenario import load_scenario, robot_file
     from rtctl.spec.shipped import scenario_file
 
     arguments.scenario = scenario_file(arguments.scenario)
+    law = load_law(arguments.law) if arguments.law else None
     prepare(str(robot_file(load_scenario(arguments.scenario), arguments.scenario)))
     with page.viewer(arguments) as shown:
-        result = simulate(arguments.scenario, log=arguments.log or None, realtime=arguments.realtime, shown=shown)
+        result = simulate(arguments.scenario, arguments.log or None, arguments.realtime, shown=shown, law=law)
     if arguments.json:
         print(json.dumps(result))
     else:

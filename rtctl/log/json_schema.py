@@ -59,6 +59,7 @@ _REQUEST = _object(
         leads=_is("boolean", "the joints head for it"),
         clear=_is("boolean", "the links in it keep the clearance"),
     ),
+    drive=_list(_NUMBER, "(n,) [Nm] of another law"),
     obstacles=_list(_object(name=_STRING, age=_is("number", "[s]"), feed=_is("boolean"), shape=_SHAPE)),
 )
 _CHECKPOINT = _object(  # its `memory`, of the tick, is an array of all kinds of things

@@ -25,6 +25,8 @@ def encode_request(tick: int, request: Request) -> bytes:
         body["payload"] = tuple(request.payload)
     if request.grip is not None:
         body["grip"] = tuple(request.grip)
+    if request.drive is not None:
+        body["drive"] = request.drive
     return msgspec.json.encode(body)
 
 
@@ -50,6 +52,7 @@ def decode_request(data: bytes) -> tuple[int, Request]:
             payload,
             None if advice is None else _advice(advice),
             _grip(body),
+            None if body.get("drive") is None else tuple(map(float, body["drive"])),
         )
         return int(body["tick"]), asked
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
