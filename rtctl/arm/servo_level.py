@@ -122,13 +122,11 @@ def _astray(c: RecordRow, m: RecordRow, n: int) -> bool:
 
 
 @kernel
-def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, model: Model, g: F64) -> F64:
+def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, g: F64) -> F64:
     """Return the torque (n,) [Nm] of a stop, and note when it is over.
 
-    Where the measurements are true it is damped: g - decay A qd, so that every motion decays at the same rate in any
-    posture; D qd with the inertia of each joint by itself would be several times slower for all joints together. Where
-    one of them lies, that and the g of the next posture drive the arm away: then g fades within FADE, and the brakes
-    have it.
+    Where the measurements are true it is damped: -D qd + g. Where one of them lies, -D qd and the g of the next
+    posture drive the arm away: then g fades within FADE, and the brakes have it.
     """
     since = (m.tick - m.since) * c.dt
     distrust = m.in_force & DISTRUST != 0
@@ -138,10 +136,9 @@ def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, model: Model, g: F64) 
     if distrust:
         keep *= max(1.0 - since / FADE, 0.0)
         return keep
-    for k in range(g.shape[0]):
-        if f.age[k] <= c.safety_lost_periods * c.dt:  # a velocity that old damps nothing
-            for i in range(g.shape[0]):
-                keep[i] -= c.stop_decay * model.A[i, k] * m.qd[k]
+    for i in range(g.shape[0]):  # a velocity that old damps nothing
+        fresh = 1.0 if f.age[i] <= c.safety_lost_periods * c.dt else 0.0
+        keep[i] = g[i] - c.stop_damping[i] * m.qd[i] * fresh
     return keep
 
 
@@ -203,7 +200,7 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
     n, noticed = f.q.shape[0], m.noticed != 0
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
     if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp or fade, then torque off
-        drive, keep = np.zeros(n), _stop_torque(c, m, f, model, model.g - m.lasting[:n] if noticed else model.g)
+        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g - m.lasting[:n] if noticed else model.g)
     command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
     bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
     limited, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
