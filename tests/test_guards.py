@@ -1,5 +1,7 @@
 """The guards against their promises, and their search against another solver."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import quadprog
@@ -13,10 +15,11 @@ from rtctl.arm.bounds import (
     Bounds,
     MotionLimits,
     SelfPairs,
+    TipMotion,
     approach_bound,
     joint_bounds,
     self_bounds,
-    tip_bound,
+    tip_bounds,
 )
 from rtctl.arm.field import Field, MovingPoints, field, field_buffers, field_params
 from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
@@ -183,17 +186,61 @@ def test_the_tip_is_not_pushed_past_its_speed(tau: F64, direction: list[float], 
         return
     u = np.array(direction) / size
     model = model_at(PANDA_HOME, np.zeros(7))
-    row = np.zeros((1, 7))
-    bound = tip_bound(model.J, np.zeros(6), model.A_inv, v * u, 0.5, RATE, row)
+    rows, most = np.zeros((2, 7)), np.zeros(2)
+    tip_bounds(TipMotion(model.J, np.zeros(6), v * u, np.zeros(7)), model.A_inv, 0.5, RATE, rows, most)
     low = np.full(7, -1e6)
-    added, acts = guard(model.A, model.A_inv, tau, low, -low, row, np.array([bound]))
+    added, acts = guard(model.A, model.A_inv, tau, low, -low, rows, most)
     before, after = (u @ model.J[:3] @ model.A_inv @ t for t in (tau, tau + added))
     if acts:
         assert v + after * SPEED_HORIZON <= max(0.5, v) + 2e-3
-        assert after == pytest.approx(bound, abs=0.1)
+        assert after == pytest.approx(most[0], abs=0.1)
     else:
         assert after == before
         assert v < 0.05 or v + before * SPEED_HORIZON <= 0.5 + 1e-9
+
+
+def pushed_about(push: Callable[[F64], F64], v: F64, step: float) -> float:
+    """Return the top speed [m/s] of a kilogram pushed about, its force [N] slewed by `step` a period of 1 ms."""
+    eye, low, sent, top = np.eye(3), np.full(3, -1e6), np.zeros(3), 0.0
+    for _ in range(2000):
+        rows, most = np.zeros((2, 3)), np.zeros(2)
+        tip_bounds(TipMotion(np.eye(6)[:, :3], np.zeros(6), v, sent), eye, 0.5, np.full(3, 1e3 * step), rows, most)
+        wanted = push(v)
+        for _ in range(2):  # what the guards let pass, then what the limiter leaves of it
+            wanted = wanted + guard(eye, eye, wanted, low, -low, rows, most)[0]
+            change = wanted - sent
+            wanted = sent + change * min(1.0, step / max(float(np.abs(change).max()), 1e-12))  # all as one
+        sent = wanted
+        v = v + 1e-3 * sent
+        top = max(top, float(np.linalg.norm(v)))
+    return top
+
+
+@pytest.mark.parametrize("step", [0.1, 0.2, 1.0])
+@pytest.mark.parametrize("strength", [10.0, 60.0, 1000.0])
+def test_a_tip_that_is_pushed_aside_keeps_its_speed(step: float, strength: float):
+    """A force across its way makes a tip no faster at first; it is too large to be taken back when it does."""
+    aside = np.array([0.0, strength, 0.0])
+    assert pushed_about(lambda _: aside, np.array([0.5, 0.0, 0.0]), step) <= 1.02 * 0.5
+
+
+@pytest.mark.parametrize("step", [0.1, 0.2, 1.0])
+def test_a_tip_that_is_pushed_aside_all_along_keeps_its_speed(step: float):
+    assert pushed_about(lambda v: 120.0 * np.array([-v[1], v[0], 0.0]), np.array([0.5, 0.0, 0.0]), step) <= 1.02 * 0.5
+
+
+@pytest.mark.parametrize("step", [0.1, 0.2, 1.0])
+def test_a_tip_that_is_turned_round_keeps_its_speed(step: float):
+    """What brakes it hard would throw it back."""
+    assert pushed_about(lambda _: np.array([-1000.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0]), step) <= 1.02 * 0.5
+
+
+def test_a_tip_that_brakes_gently_is_not_touched():
+    rows, most = np.zeros((2, 3)), np.zeros(2)
+    for v in (0.49, 0.3, 0.1, 0.01):
+        tip = TipMotion(np.eye(6)[:, :3], np.zeros(6), np.array([v, 0.0, 0.0]), np.array([-5.0, 0.0, 0.0]))
+        tip_bounds(tip, np.eye(3), 0.5, np.full(3, 200.0), rows, most)
+        assert (rows @ tip.qdd < most).all()
 
 
 def beside_wall(x: float, v: float) -> tuple[MovingPoints, Field]:
@@ -302,7 +349,7 @@ def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch(
         qd, rho = np.array([v, 0.0, 0.0]), np.array([x if x < arm.own.reach else np.inf])
         push, _, _ = own_field(rho, row, ZERO, qd, eye, params, NO_ENDS)
         low = np.full(3, -1e6)
-        bounds = Bounds(low, -low, np.zeros((2, 3)), np.full(2, np.inf))
+        bounds = Bounds(low, -low, np.zeros((3, 3)), np.full(3, np.inf))
         approach = ApproachParams(arm.avoid.rho0, params.rho_min, arm.motion.v_max, arm.motion.a_max)
         self_bounds(SelfPairs(rho, row, ZERO), eye, qd, approach, np.full(3, 1e3 * step), bounds)
         added, _ = guard(eye, eye, push, low, -low, bounds.rows, bounds.most)

@@ -52,6 +52,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
             False,
             np.zeros(7),
             law.nothing_ahead(arm),
+            np.zeros(0),
         ),
     )
 
@@ -60,7 +61,7 @@ def interpreted(patch: Patch) -> None:
     """Let the law look its parts up when it runs, so that one of them can be exchanged."""
     whole = law.law.py_func
     parts = "_work_in rows_in _params _motion_limits _torques _bound _bounds _approach _near nearby_in"
-    for part in (*parts.split(), "_let_pass", "_hold_back"):
+    for part in (*parts.split(), "_slewed", "_let_pass", "_hold_back"):
         patch.setattr(law, part, getattr(law, part).py_func)
     patch.setattr(law, "law", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
     patch.setattr(servo_level, "law", law.law)
@@ -367,7 +368,11 @@ def test_the_speed_limit_holds(monkeypatch: Patch):
         out.linear[:], out.angular[:] = p.k_p / p.k_v * error.linear, p.k_p / p.k_v * error.angular
 
     monkeypatch.setattr(law, "velocity_reference", unlimited)
-    monkeypatch.setattr(law, "tip_bound", lambda *a: np.inf)
+
+    def unbounded(*a: Any) -> None:
+        a[-1][:2] = np.inf
+
+    monkeypatch.setattr(law, "tip_bounds", unbounded)
     assert not within_the_speed_limit()
 
 

@@ -54,7 +54,7 @@ def law_at(q: F64, qd: F64 | None = None, balls: tuple[tuple[float, ...], ...] =
     obstacles = changes.pop("obstacles", space_of(balls))
     still = Twist(ZERO, ZERO)
     error, previous = Twist(changes.pop("e", ZERO), ZERO), Twist(changes.pop("v_ref", ZERO), ZERO)
-    plain = (still, still, q, 1.0, np.zeros(7), False, np.zeros(7), nothing_ahead(arm))
+    plain = (still, still, q, 1.0, np.zeros(7), False, np.zeros(7), nothing_ahead(arm), np.zeros(0))
     motion = Motion(q, qd, Twist(twist[:3], twist[3:]), *plain)
     return evaluate_law(arm, model, space, obstacles, motion._replace(error=error, previous=previous, **changes))
 
@@ -104,6 +104,32 @@ def test_braking_keeps_the_direction_and_loses_speed_at_a_max():
     v = np.array([0.3, 0.0, 0.4])
     law = law_at(ROUGH, v_ref=v)
     np.testing.assert_allclose(law.v_ref, v * (1.0 - robot().motion.a_max * robot().dt / 0.5), rtol=1e-9)
+
+
+def top_speed(strength: float, way: F64, axis: F64, told: bool) -> float:
+    """Return the top speed of a tip, of v_max, that a hand pushes across its way, as the limiter slews the torque."""
+    arm = robot()
+    qd = np.linalg.pinv(model_at(ROUGH, np.zeros(7)).J) @ np.array([*(0.96 * arm.motion.v_max * way), 0.0, 0.0, 0.0])
+    sent, qdd, top = model_at(ROUGH, qd).g + model_at(ROUGH, qd).h, np.zeros(7), 0.0
+    for _ in range(250):
+        model = model_at(ROUGH, qd)
+        J, v = model.J[:3], model.J[:3] @ qd
+        push = J.T @ (strength * np.cross(axis, v) / np.linalg.norm(v))
+        law = law_at(ROUGH, qd, floats=True, hand=push, qdd=qdd, sent=sent if told else np.zeros(0), model=model)
+        change = law.drive + law.keep - sent
+        sent = sent + change * min(1.0, float((arm.tau_rate * arm.dt / np.maximum(np.abs(change), 1e-12)).min()))
+        qdd = model.A_inv @ (sent - model.g - model.h)
+        qd = qd + arm.dt * qdd
+        top = max(top, float(np.linalg.norm(J @ qd)))
+    return top / arm.motion.v_max
+
+
+@pytest.mark.parametrize(("strength", "way", "axis"), [(100.0, 0, 2), (300.0, 0, 2), (30.0, 2, 1)])
+def test_the_guards_judge_what_the_limiter_leaves_of_a_torque(strength: float, way: int, axis: int):
+    """It slows all joints down as one: braking the tip waits for a joint that has a long way to go."""
+    x = np.eye(3)
+    assert top_speed(strength, x[way], x[axis], True) <= 1.02
+    assert top_speed(strength, x[way], x[axis], False) > 1.02
 
 
 def test_far_obstacles_change_no_bit():

@@ -213,6 +213,7 @@ def case(robot: Robot, m: int, slots: int) -> Case:
         False,
         np.zeros(robot.n),
         nothing_ahead(robot),
+        np.zeros(0),
     )
     return Case(small, model, space, obstacles, motion)
 
@@ -335,6 +336,7 @@ class BoundFloor:
                 osc.SPEED_FLOOR,
                 bounds.JERK_SHARE,
                 bounds.TIP_SLOW,
+                bounds.ALIGNED,
                 nearby.APPROACH_ZONE,
                 nearby.LINK_BAND,
                 least_change.STEPS_MAX,

@@ -15,7 +15,7 @@ enum { Q, QD, Q_EVAL, A, A_INV, H, G, J, JDQD, LAMBDA, JBAR, NT, P, JP, B, RADIU
        Q_REST, QDD, Q_MIN, Q_MAX, QD_MAX, TAU_MAX, TAU_RATE, BRAKING, QDD_POSTURE, L_RHO0, L_MIN, L_NUM, L_ETA, L_KD, CENTRE,
        SPEED, BALL };
 enum { KP, KV, V_MAX, A_MAX, W_MAX, ALPHA_MAX, MARGIN, KQ, DQ, RHO0, RHO_MIN, RHO_NUM, ETA, KD, LOOK, SOFT, M_MAX, DT,
-       BAND, HORIZON, SHARE, SLOWEST, JERK, TIP_SLOW, ZONE, BAND_LINK, STEPS, ROWS,
+       BAND, HORIZON, SHARE, SLOWEST, JERK, TIP_SLOW, ALIGNED, ZONE, BAND_LINK, STEPS, ROWS,
        YIELD, TURNED };
 
 constexpr int N = 16, M = 128, K = 256;  // room
@@ -26,8 +26,8 @@ int near_list[K][M], near_count[K];
 constexpr int R = 512, CANDIDATES = 2048;
 struct Candidate { int k, j, state; double most; } cand[CANDIDATES];  // state: 0 cheap bound, 1 exact, 2 row made
 double accel[3][M], steep[M];                                         // of the candidates' points
-double rows[R][N], bound[R], stiff[R], over[2][R], high[N], low[N], tip_row[N], tip_most;
-bool made[2 * N + 1];
+double rows[R][N], bound[R], stiff[R], over[2][R], high[N], low[N], tip_row[2][N], tip_most[2];
+bool made[2 * N + 2];
 int row_count, cand_count;
 
 int64_t now() {
@@ -143,9 +143,11 @@ void collect(const double *const *a, const double *s, int n, int m, double x[2][
             add_row(i < n ? high[i] : -low[i - n], a[A_INV][(i % n) * (n + 1)], x, n, s), made[i] = true;
         }
     }
-    if (tip_most < INFINITY && !made[2 * n] && row_count < R && dot(tip_row, x[side], n) > tip_most) {
-        for (int k = 0; k < n; k++) rows[row_count][k] = tip_row[k];
-        add_row(tip_most, mobility(a[A_INV], tip_row, n), x, n, s), made[2 * n] = true;
+    for (int t = 0; t < 2; t++) {
+        const double *row = tip_row[t], most = tip_most[t];
+        if (!(most < INFINITY) || made[2 * n + t] || row_count == R || !(dot(row, x[side], n) > most)) continue;
+        for (int k = 0; k < n; k++) rows[row_count][k] = row[k];
+        add_row(most, mobility(a[A_INV], row, n), x, n, s), made[2 * n + t] = true;
     }
     if (cand_count) accelerate(a, x[side], n, m);
     for (int i = 0; i < cand_count; i++) {
@@ -166,7 +168,8 @@ void collect(const double *const *a, const double *s, int n, int m, double x[2][
 bool passed(const double *const *a, const double *x, int n, int m) {
     for (int i = 0; i < n; i++)
         if (x[i] > high[i] || x[i] < low[i]) return true;
-    if (tip_most < INFINITY && dot(tip_row, x, n) > tip_most) return true;
+    for (int t = 0; t < 2; t++)
+        if (tip_most[t] < INFINITY && dot(tip_row[t], x, n) > tip_most[t]) return true;
     if (cand_count) accelerate(a, x, n, m);
     for (int i = 0; i < cand_count; i++)
         if (closing(cand[i]) > cand[i].most) return true;
@@ -269,7 +272,7 @@ void guarded(const double *const *a, const double *s, const double *load, int n,
         }
     }
     row_count = 0;
-    for (int i = 0; i <= 2 * n; i++) made[i] = false;
+    for (int i = 0; i < 2 * n + 2; i++) made[i] = false;
     for (int i = 0; i < n; i++) x[0][i] = a[QDD][i];
     for (int attempt = 0; attempt < 2; attempt++) {
         nearest_kept(a, s, n, m, wanted, x);
@@ -347,6 +350,14 @@ void field(const double *const *a, const double *s, const int64_t *link, int n, 
     }
 }
 
+// Writes tip_row[t] along v (3,) and returns the jerk along it.
+double tip_along(const double *const *a, const double *s, const double *v, int t, int n) {
+    double size = std::sqrt(dot(v, v, 3));
+    tmv(a[J], v, 3, n, tip_row[t]);
+    for (int i = 0; i < n; i++) tip_row[t][i] /= size;
+    return jerk_along(tip_row[t], mobility(a[A_INV], tip_row[t], n), a[TAU_RATE], n, s);
+}
+
 // The bounds of the guards: joints, the tip, and cheap ones of the points that approach an obstacle.
 void gather(const double *const *a, const double *s, const int64_t *link, int n, int m, int slots) {
     for (int i = 0; i < n; i++) {
@@ -361,13 +372,21 @@ void gather(const double *const *a, const double *s, const int64_t *link, int n,
         if (low[i] > 0) high[i] = std::max(high[i], low[i]);
         else if (high[i] < 0) low[i] = std::min(low[i], high[i]);
     }
-    double speed = std::sqrt(dot(a[XD], a[XD], 3));
-    tip_most = INFINITY;
-    if (!(speed < s[TIP_SLOW] * s[V_MAX])) {
-        tmv(a[J], a[XD], 3, n, tip_row);
-        for (int i = 0; i < n; i++) tip_row[i] /= speed;
-        double jerk = jerk_along(tip_row, mobility(a[A_INV], tip_row, n), a[TAU_RATE], n, s);
-        tip_most = may(s[V_MAX], speed, jerk, s) - dot(a[JDQD], a[XD], 3) / speed;
+    double v[3], speed = std::sqrt(dot(a[XD], a[XD], 3)), accel = 0, along = 0, peak = 0;
+    tip_most[0] = tip_most[1] = INFINITY;
+    for (int c = 0; c < 3; c++) v[c] = a[JDQD][c] + dot(a[J] + c * n, a[QDD], n), accel += v[c] * v[c];
+    if (accel > 0) {
+        double back = 0.5 * std::sqrt(accel) / std::max(tip_along(a, s, v, 1, n), 1e-9);
+        for (int c = 0; c < 3; c++) v[c] = a[XD][c] + back * v[c], peak += v[c] * v[c], along += v[c] * a[XD][c];
+        peak = std::sqrt(peak);
+        if (peak >= s[TIP_SLOW] * s[V_MAX] && along < s[ALIGNED] * peak * speed) {
+            double jerk = tip_along(a, s, v, 1, n);
+            tip_most[1] = may(s[V_MAX], along / peak, jerk, s) - dot(a[JDQD], v, 3) / peak;
+        }
+    }
+    if (speed >= s[TIP_SLOW] * s[V_MAX]) {
+        double jerk = tip_along(a, s, a[XD], 0, n);
+        tip_most[0] = may(s[V_MAX], speed, jerk, s) - dot(a[JDQD], a[XD], 3) / speed;
     }
     const double zone = s[ZONE] * s[RHO0];
     double best[N + 1];

@@ -16,6 +16,8 @@ SPEED_BAND = 0.9  # fraction of qd_max that the guard lets joints have
 SPEED_HORIZON = 0.02  # [s] within which it wants a bound kept: ten times what two periods of delay at 1 kHz bear
 JERK_SHARE = 0.5  # of the torque rate counted on: the joints slew as one, the others want their part
 TIP_SLOW = 0.1  # of v_max, below which the tip needs no guard
+TIP_ROWS = 2  # of the tip: along its velocity, and along that which its acceleration leads to
+ALIGNED = 0.999  # cosine of the angle between the two, from which one of them is enough
 SELF_APPROACH_SHARE = 0.15  # of v_max, at which a link may come near another of the same arm: their field turns it
 
 
@@ -37,6 +39,15 @@ class ApproachParams(NamedTuple):
     self_stop: float  # [m] before which the approach of two links of the arm is slowed
     v_max: float  # [m/s]
     braking: float  # [m/s2] with which an approach is counted to be stopped
+
+
+class TipMotion(NamedTuple):
+    """How the tip moves."""
+
+    J: F64  # (6, n) Jacobian
+    Jdqd: F64  # (6,) its velocity product
+    xd: F64  # (3,) [m/s]
+    qdd: F64  # (n,) [rad/s2] accelerations under way: of the torque sent last
 
 
 class SelfPairs(NamedTuple):
@@ -111,38 +122,64 @@ def jerk_along(rows: F64, r: int, along: float, tau_rate: F64) -> float:
 
 
 @leaf_kernel
-def tip_bound(J: F64, Jdqd: F64, A_inv: F64, xd: F64, v_max: float, tau_rate: F64, rows: F64) -> float:
-    """Write rows[0] (n,) along the tip's velocity xd (3,); return the bound of row qdd that keeps |xd| below v_max.
+def _tip_along(tip: TipMotion, x: float, y: float, z: float, rows: F64, r: int) -> float:
+    """Write row r (n,) of the tip along (x, y, z), and return the length of that."""
+    size = math.sqrt(x * x + y * y + z * z)
+    for i in range(tip.J.shape[1]):
+        rows[r, i] = (tip.J[0, i] * x + tip.J[1, i] * y + tip.J[2, i] * z) / size
+    return size
 
-    The motion task never asks for more than v_max [m/s]; a field that shoves the arm may. inf while the tip is slow.
+
+@leaf_kernel
+def tip_bounds(tip: TipMotion, A_inv: F64, v_max: float, tau_rate: F64, rows: F64, most: F64) -> None:
+    """Write the TIP_ROWS first rows and bounds of row qdd that keep the tip's speed below v_max [m/s].
+
+    Along its velocity v, and along p = v + a |a|/(2 j), what that comes to when its acceleration a is taken back from
+    now on at the jerk j: an acceleration across a fast tip's way, or one that turns it round, makes it no faster now,
+    and is too large to be taken back by the time it does.
+
+    The motion task never asks for more than v_max; a field that shoves the arm may. inf while the tip is slow.
     """
-    speed = math.sqrt(xd[0] * xd[0] + xd[1] * xd[1] + xd[2] * xd[2])
-    if speed < TIP_SLOW * v_max:
-        return math.inf
+    v, J = tip.xd, tip.J
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    most[0], most[1] = math.inf, math.inf
+    x, y, z = tip.Jdqd[0], tip.Jdqd[1], tip.Jdqd[2]
     for i in range(J.shape[1]):
-        rows[0, i] = (J[0, i] * xd[0] + J[1, i] * xd[1] + J[2, i] * xd[2]) / speed
-    drift = (Jdqd[0] * xd[0] + Jdqd[1] * xd[1] + Jdqd[2] * xd[2]) / speed
-    jerk = jerk_along(rows, 0, mobility(A_inv, rows, 0), tau_rate)
-    bound: float = acceleration_bound(v_max, speed, jerk) - drift
-    return bound
+        x, y, z = x + J[0, i] * tip.qdd[i], y + J[1, i] * tip.qdd[i], z + J[2, i] * tip.qdd[i]
+    if x * x + y * y + z * z > 0.0:
+        size = _tip_along(tip, x, y, z, rows, 1)
+        back = 0.5 * size / max(jerk_along(rows, 1, mobility(A_inv, rows, 1), tau_rate), 1e-9)  # [s]
+        x, y, z = v[0] + back * x, v[1] + back * y, v[2] + back * z
+        peak, along = math.sqrt(x * x + y * y + z * z), v[0] * x + v[1] * y + v[2] * z
+        if peak >= TIP_SLOW * v_max and along < ALIGNED * peak * speed:
+            _tip_along(tip, x, y, z, rows, 1)
+            drift = (tip.Jdqd[0] * x + tip.Jdqd[1] * y + tip.Jdqd[2] * z) / peak
+            jerk = jerk_along(rows, 1, mobility(A_inv, rows, 1), tau_rate)
+            most[1] = acceleration_bound(v_max, along / peak, jerk) - drift
+    if speed >= TIP_SLOW * v_max:
+        _tip_along(tip, v[0], v[1], v[2], rows, 0)
+        drift = (tip.Jdqd[0] * v[0] + tip.Jdqd[1] * v[1] + tip.Jdqd[2] * v[2]) / speed
+        jerk = jerk_along(rows, 0, mobility(A_inv, rows, 0), tau_rate)
+        most[0] = acceleration_bound(v_max, speed, jerk) - drift
 
 
 @leaf_kernel
 def self_bounds(pairs: SelfPairs, A_inv: F64, qd: F64, p: ApproachParams, tau_rate: F64, out: Bounds) -> None:
-    """Write rows and bounds, from the second on, along which links of the arm come nearer to each other.
+    """Write rows and bounds, behind those of the tip, along which links of the arm come nearer to each other.
 
     Every pair that is measured counts, and is slowed before self_stop to what its field turns easily: that field is
     thin and steep, and torque that is slewed comes too late for a link that enters it fast. Slower than that only
     touching is prevented: a guard as steep as the field would set a folded arm swinging between two pairs.
     """
     for s in range(pairs.rho.shape[0]):
-        out.most[1 + s] = math.inf
+        r = TIP_ROWS + s
+        out.most[r] = math.inf
         if pairs.rho[s] == math.inf:
             continue
         for i in range(qd.shape[0]):
-            out.rows[1 + s, i] = -pairs.row[s, i]
-        room, speed = pairs.rho[s] + dot(pairs.row, s, pairs.dq), dot(out.rows, 1 + s, qd)
-        jerk = jerk_along(out.rows, 1 + s, mobility(A_inv, out.rows, 1 + s), tau_rate)
+            out.rows[r, i] = -pairs.row[s, i]
+        room, speed = pairs.rho[s] + dot(pairs.row, s, pairs.dq), dot(out.rows, r, qd)
+        jerk = jerk_along(out.rows, r, mobility(A_inv, out.rows, r), tau_rate)
         fast = approach_bound(room - p.self_stop, speed, math.inf, p.braking, jerk)
         free = approach_bound(room, speed, SELF_APPROACH_SHARE * p.v_max, p.braking, jerk)
-        out.most[1 + s] = max(fast, free)
+        out.most[r] = max(fast, free)

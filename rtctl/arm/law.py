@@ -9,7 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.bounds import ApproachParams, Bounds, MotionLimits, SelfPairs, joint_bounds, self_bounds, tip_bound
+from rtctl.arm.bounds import (
+    TIP_ROWS,
+    ApproachParams,
+    Bounds,
+    MotionLimits,
+    SelfPairs,
+    TipMotion,
+    joint_bounds,
+    self_bounds,
+    tip_bounds,
+)
 from rtctl.arm.escape import STALL
 from rtctl.arm.field import (
     APART,
@@ -159,10 +169,11 @@ class Motion(NamedTuple):
     previous: Twist  # velocity references of the last tick
     q_rest: F64  # (n,) [rad] the posture
     speed_scale: float  # fraction of qd_max that joints may have
-    qdd: F64  # (n,) [rad/s2] of the last tick, where the guards begin to search: how long, not what they find
+    qdd: F64  # (n,) [rad/s2] of the torque sent last; there the guards begin to search
     floats: bool  # a hand or another law moves the arm: no motion, no posture
     hand: F64  # (n,) [Nm] then
     ahead: Ahead
+    sent: F64  # (n,) [Nm] torque under way, from which what is sent is slewed; (0,): nothing moves yet
 
 
 def nothing_ahead(robot: Robot) -> Ahead:
@@ -308,8 +319,8 @@ def _motion_limits(c: RecordRow, n: int, speed_scale: float, qd_max: F64) -> Mot
 
 
 # rows of the work array of a tick, (rows, n): first the four of `osc.motion_torque`, last those of the bounds
-_DQ, _QD_MAX, _SELF, _LIMITS, _REPEL, _LOAD, _DRIVE, _KEEP, _LOW, _HIGH, _DIAGONAL, _SUM, _SENT, _LESS, _ROWS = range(
-    4, 19
+_DQ, _QD_MAX, _SELF, _LIMITS, _REPEL, _LOAD, _DRIVE, _KEEP, _LOW, _HIGH, _DIAGONAL, _SUM, _SENT, _LESS, _AIM, _ROWS = (
+    range(4, 20)
 )
 
 
@@ -356,14 +367,14 @@ class _Work(NamedTuple):
 def work_sizes(slots: int, m: int, n: int, pairs: int) -> tuple[int, int]:
     """Return the sizes of the WorkMemory of K = `slots` obstacles, m points, n joints, L = `pairs` pairs of links."""
     (a, b), (c, d) = field_sizes(slots, m, n), rows_sizes(n)
-    candidates, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    candidates, known = min(slots * m, CANDIDATES_MAX), TIP_ROWS + pairs
     return a + (_ROWS + known) * n + known + candidates + 4 * m + n + 1 + c, b + 3 * candidates + 1 + 2 * n + known + d
 
 
 @leaf_kernel
 def _work_in(memory: WorkMemory, slots: int, m: int, n: int, pairs: int) -> _Work:
     """Return the law's arrays in the memory; see `work_sizes`."""
-    c, known = min(slots * m, CANDIDATES_MAX), 1 + pairs
+    c, known = min(slots * m, CANDIDATES_MAX), TIP_ROWS + pairs
     a, b = n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)
     most = a + (_ROWS + known) * n
     real = most + known
@@ -451,9 +462,8 @@ def _bound(constants: Record, model: Model, motion: Motion, w: F64, most: F64) -
     n, bounds = motion.q.shape[0], _bounds(w, most)
     p, limits = _params(constants[0], n), _motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
     joint_bounds(model.A, motion.q, motion.qd, limits, bounds.low, bounds.high)
-    most[0] = tip_bound(
-        model.J, model.Jdqd, model.A_inv, motion.actual.linear, p.motion.v_max, limits.tau_rate, bounds.rows
-    )
+    tip = TipMotion(model.J, model.Jdqd, motion.actual.linear, motion.qdd)
+    tip_bounds(tip, model.A_inv, p.motion.v_max, limits.tau_rate, bounds.rows, most)
     pairs = SelfPairs(model.own_rho, model.own_row, w[_DQ])
     self_bounds(pairs, model.A_inv, motion.qd, _approach(constants[0]), limits.tau_rate, bounds)
 
@@ -487,6 +497,25 @@ def _hold_back(constants: Record, cover: Cover, seen: Field, model: Model, motio
         work.rows.x[0, i] = motion.qdd[i]
     bounds = _bounds(w, work.most)
     return hold_back(work.rows, inertia, motors, w[_SUM], bounds, near, work.made, w[_SENT : _LESS + 1])
+
+
+@leaf_kernel
+def _slewed(c: RecordRow, sent: F64, w: F64) -> bool:
+    """Return whether the limiter will slew row _SENT of the work; then row _SUM is what it leaves of it in this tick.
+
+    It slows all joints down as one: where one is far from what it is asked for, the others get little of theirs.
+    """
+    share = 1.0
+    for i in range(sent.shape[0]):
+        step = abs(w[_SENT, i] + w[_LOAD, i] - sent[i])
+        if step * share > c.tau_rate[i] * c.dt:
+            share = c.tau_rate[i] * c.dt / step
+    if share == 1.0:
+        return False
+    for i in range(sent.shape[0]):
+        w[_AIM, i] = w[_SENT, i]
+        w[_SUM, i] = sent[i] + share * (w[_SENT, i] + w[_LOAD, i] - sent[i]) - w[_LOAD, i]
+    return True
 
 
 @leaf_kernel
@@ -538,6 +567,12 @@ def law(
     acts = False
     if not _let_pass(constants, cover, seen, model, motion, work):
         acts = _hold_back(constants, cover, seen, model, motion, work)
+    if _slewed(constants[0], motion.sent, work.w):  # what is on its way there must keep the bounds, too
+        if not _let_pass(constants, cover, seen, model, motion, work):
+            acts = _hold_back(constants, cover, seen, model, motion, work) or acts
+        else:
+            for i in range(n):
+                work.w[_SENT, i] = work.w[_AIM, i]
     _write(work.w, share, out.torques)
     _copy_seen(seen, out.seen, out.nearest)
     cut = _CAP if flags & CAPPED else 0

@@ -259,6 +259,8 @@ def _act(
     slots = around.rho.shape[0]
     field, out = field_in(arm.reals, arm.wholes, n, arm.radius.shape[0], slots), outputs(n, slots)
     ahead = _ahead(arm, m, around.obstacles, ends, n)
+    moves = m.state == _RUN or m.state == _STOPPING
+    sent = m.sent[0, :n].copy() if moves else np.zeros(0)
     _, m.limit_flags = law(
         arm.constants,
         Cover(arm.radius, arm.link),
@@ -278,6 +280,7 @@ def _act(
             m.floating != 0 or m.driven != 0,
             hand,
             ahead,
+            sent,
         ),
         WorkMemory(arm.reals, arm.wholes),
         out,
