@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio
 import pytest
 
+from rtctl.arm.apart import hulls_apart
 from rtctl.arm.field import CAPPED, CONTACT, field_params, own_field
 from rtctl.arm.model import RigidBody
 from rtctl.arm.self_collision import Own, nothing
@@ -81,6 +82,23 @@ def test_a_pair_is_left_out_only_where_gjk_finds_it_beyond_reach(reach: float) -
         assert (every.distances(R, t) == np.where(true < reach, true, np.inf)).all()
         asked, within = asked + len(every.near(R, t)), within + int((true < reach).sum())
     assert 10 < within <= asked < 1.2 * within  # and few are measured for nothing
+
+
+def test_whether_two_hulls_are_apart_is_what_coal_says_to_the_micrometre() -> None:
+    every = Own(own().hulls, own().pairs, np.inf)
+    touch = near = 0
+    for q in postures(150, seed=5):
+        R, t = panda().placements(q)
+        for (i, j), rho in zip(every.pairs, every.distances(R, t), strict=True):
+            for off in (-1e-2, -1e-3, -1e-6, 1e-6, 1e-3, 1e-2):
+                if rho + off > 0.0:
+                    assert hulls_apart(i, j, every.arrays, rho + off, R, t) == (off < 0.0)
+                    near += rho < REACH
+            if rho < -1e-6:
+                assert not hulls_apart(i, j, every.arrays, 1e-3, R, t)
+                touch += 1
+    assert touch > 5
+    assert near > 200
 
 
 def test_slopes_are_those_of_finite_differences() -> None:

@@ -94,6 +94,22 @@ def test_an_arm_in_a_plane_is_led_around_along_the_axes_that_it_has():
         assert ("wxyz" in told) == bool(goal.task & Task.RZ)
 
 
+def test_an_arm_folded_onto_itself_is_planned_for_from_where_it_is():
+    """14 mm between its links, which a dozen planes between them do not show."""
+    file = ROOT / "configs" / "planar4.toml"
+    arm = cfg.build(cfg.load(file), file)
+    folded = np.array([0.851, -1.047, 1.606, 2.551])
+    least = float(arm.body.own_distances(folded, arm.own).min())
+    assert 0.01 < least < 0.02
+    goals = plan(arm, folded, to(1.946, -0.226, 0.0), obstacle_table.empty(arm.slots).obstacles)
+    links = np.cumsum(goals[-1].posture)  # four links of 0.5 m
+    end = 0.5 * np.array([np.cos(links).sum(), np.sin(links).sum()])
+    np.testing.assert_allclose(end, [1.946, -0.226], atol=2e-4)
+    for a, b in pairwise(np.array([folded, *(g.posture for g in goals)])):
+        for part in np.linspace(0.0, 1.0, 10):
+            assert arm.body.own_distances(a + part * (b - a), arm.own).min() >= arm.self_avoid.rho_min
+
+
 def test_a_plan_to_a_direction_ends_in_a_posture_that_points_there():
     arm, aim = robot(), np.array([0.8, 0.6, 0.0])
     turn = quat_of(exp3(between(EYE[0], aim)))

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.arm.apart import hulls_apart
 from rtctl.arm.kinematics import Chain, chain_of, placements
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
@@ -130,8 +131,10 @@ def first_blocked(body: Body, Q: F64, obstacles: Obstacles, room: Room, share: f
                     return k
                 if not _skin_keeps(body, j, R, t, obstacles, keep):
                     return k
-            if body.pairs.shape[0] > 0 and not_apart(body.pairs, body.hulls, share * own, R, t).shape[0] > 0:
-                return k
+            if body.pairs.shape[0] > 0:
+                for s in not_apart(body.pairs, body.hulls, share * own, R, t):
+                    if not hulls_apart(body.pairs[s, 0], body.pairs[s, 1], body.hulls, share * own, R, t):
+                        return k
         first = False
         stride //= 2
     return -1
