@@ -107,7 +107,7 @@ def test_a_viewer_gets_what_the_log_draws(log: Path) -> None:
         """Send the log again and again: a viewer that comes late sees what comes then."""
         messages = followed.read_on().messages
         while not enough.is_set():
-            relay.add(messages)
+            relay.add(messages, time.monotonic())
             while relay.waits and not enough.is_set():
                 relay.send(time.monotonic())
                 time.sleep(0.002)
@@ -141,9 +141,8 @@ def test_a_viewer_gets_what_the_log_draws(log: Path) -> None:
 def test_what_is_drawn_comes_as_evenly_as_it_was_recorded(log: Path) -> None:
     followed = Tail(log, TOPICS)
     relay = Relay(followed, "127.0.0.1", 0)
-    messages = followed.read_on().messages
-    relay.add(messages)
-    begin, gone = 1e6, []
+    messages, begin, gone = followed.read_on().messages, 1e6, []
+    relay.add(messages, begin)
     try:
         for step in range(400):
             now = begin + 0.005 * step
@@ -153,6 +152,28 @@ def test_what_is_drawn_comes_as_evenly_as_it_was_recorded(log: Path) -> None:
     first = messages[0].time * 1e-9
     assert len(gone) == len([m for m in messages if m.time * 1e-9 - first + LAG <= 0.005 * 399])
     assert all(-1e-6 <= at - (sent - first) - LAG < 0.006 for at, sent in gone)
+
+
+def test_who_joins_a_run_late_sees_what_is_new(log: Path, tmp_path: Path) -> None:
+    """A file that is still written: what is in it already is no story to be told from its beginning."""
+    growing = tmp_path / "run.mcap.open"
+    growing.write_bytes(log.read_bytes())
+    followed = Tail(growing, TOPICS)
+    relay = Relay(followed, "127.0.0.1", 0)
+    messages, begin, gone = followed.read_on().messages, 1e6, []
+    newest = messages[-1].time
+    later = [m._replace(time=newest + round(1e9 * (0.03 * (k + 1)))) for k, m in enumerate(messages[:8])]
+    try:
+        relay.add([m._replace(time=m.time - round(60e9)) for m in messages] + messages[-1:], begin)
+        for step in range(400):
+            now = begin + 0.005 * step
+            if step == 50:
+                relay.add(later, now)
+            gone += [(now - begin, m) for m in relay._due(now)]
+    finally:
+        relay.close()
+    assert [m for _, m in gone] == [messages[-1], *later]
+    assert all(-1e-6 <= sent - LAG - 1e-9 * (m.time - newest) < 0.006 for sent, m in gone)
 
 
 def test_the_command_names_the_address_and_ends_with_the_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:

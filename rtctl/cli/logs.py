@@ -270,7 +270,7 @@ def _follow(arguments: argparse.Namespace, followed: "Tail", relay: "Relay | Non
     while True:
         new = followed.read_on()
         if relay is not None:
-            relay.add(new.messages)
+            relay.add(new.messages, time.monotonic())
         for event in new.events:
             _say(event, arguments.json)
         if len(new.ticks) and float(new.ticks["time"][-1]) - shown >= arguments.every:

@@ -3,6 +3,7 @@
 A file grows by chunks of a quarter of a second. What is drawn comes as evenly as it was recorded, LAG later.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -10,14 +11,15 @@ from typing import TYPE_CHECKING
 
 from rtctl.errors import UsageError
 from rtctl.log import schema
+from rtctl.log.mcap.names import OPEN
 from rtctl.log.read.follow import Message, Tail
 
 if TYPE_CHECKING:
     import foxglove
 
 TOPICS = (schema.TF, schema.SCENE, schema.LOG)
-LAG = 0.6  # [s] behind the log: two chunks and a look
-BEHIND = 2.0  # [s] more than that is not caught up with, but left out
+LAG = 0.6  # [s] behind the newest: two chunks and a look
+BEHIND = 2.0  # [s] what is later than that, as the beginning of a run that is joined late, is left out
 LOOK = 0.01  # [s] between messages that are due
 
 
@@ -31,7 +33,8 @@ class Relay:
         self._tail = tail
         self._channels: dict[str, foxglove.Channel] = {}
         self._waiting: deque[Message] = deque()
-        self._offset: float | None = None  # [s] of this clock less the log's
+        self._live = tail.path.name.endswith(OPEN)  # else it is played from its beginning
+        self._offset = math.inf  # [s] of this clock less the log's
         self._context = foxglove.Context()
         try:
             self._server = foxglove.start_server(
@@ -41,8 +44,10 @@ class Relay:
             raise UsageError(f"log tail: {host}:{port}: {error}; another --port is free perhaps") from None
         self.url = f"ws://{host}:{self._server.port}"
 
-    def add(self, messages: list[Message]) -> None:
-        """Take what a look at the file brought."""
+    def add(self, messages: list[Message], now: float) -> None:
+        """Take what a look at the file brought at `now` [s] of the monotonic clock."""
+        if messages and (self._live or self._offset == math.inf):
+            self._offset = min(self._offset, now - messages[-1 if self._live else 0].time * 1e-9)
         self._waiting.extend(messages)
 
     @property
@@ -57,12 +62,12 @@ class Relay:
 
     def _due(self, now: float) -> Iterator[Message]:
         while self._waiting:
-            at = self._waiting[0].time * 1e-9
-            if self._offset is None or now - at - self._offset > BEHIND:
-                self._offset = now - at + LAG
-            if at + self._offset > now:
+            late = now - (self._waiting[0].time * 1e-9 + self._offset + LAG)
+            if late < 0.0:
                 return
-            yield self._waiting.popleft()
+            message = self._waiting.popleft()
+            if late < BEHIND or not self._live:
+                yield message
 
     def _channel(self, topic: str) -> "foxglove.Channel":
         if topic not in self._channels:
