@@ -124,7 +124,7 @@ class Camera:
                 reply = json.loads(raw)
             except ValueError:
                 continue
-            if isinstance(reply, dict) and not reply.get("ok"):
+            if isinstance(reply, dict) and not reply.get("ok") and "starting" not in reply:  # else it is told again
                 self.refused += 1
                 self.refusal = str(reply.get("error", ""))
 

@@ -1,8 +1,10 @@
 """Campaigns: nothing is lost and nothing is played twice, whoever dies; rates; scenes made small."""
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,6 +19,7 @@ from scipy.stats import binomtest
 from rtctl.campaign import rates
 from rtctl.campaign.case import Case, Scene
 from rtctl.campaign.case import code as code_of
+from rtctl.campaign.engine import _client
 from rtctl.campaign.minimise import ddmin, minimised
 from rtctl.campaign.robots import grid, text_of
 from rtctl.campaign.store import Store
@@ -58,6 +61,16 @@ def test_two_workers_of_which_one_is_killed_give_what_one_process_gives(tmp_path
     assert [one[k]["digest"] for k in range(6)] == [two[k]["digest"] for k in range(6)]
     assert all(one[k]["digest"] for k in range(6))
     assert plays(tmp_path / "a") == dict.fromkeys(range(6), 1)
+
+
+def test_a_campaign_beside_another_starts_without_a_word():
+    """8787 is where Dask has a page by default; that another has it is a warning, which is an error here."""
+    with socket.socket() as taken:
+        with contextlib.suppress(OSError):  # somebody has it: just as well
+            taken.bind(("127.0.0.1", 8787))
+            taken.listen()
+        with _client(1, "") as client:
+            assert client.submit(int, 7).result(timeout=120) == 7
 
 
 def test_a_killed_client_loses_nothing_and_nothing_is_played_twice(tmp_path: Path):

@@ -79,16 +79,15 @@ def test_joints_are_accelerated_as_the_law_says_and_gravity_is_given_beside_it()
         assert np.abs(here.simulator.truth().qd).max() < 0.02
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_law_of_noise_harms_nothing(seed: int):
+def test_a_law_of_noise_harms_nothing():
     """Torques at random up to all that the motors have, among balls that only the controller sees."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     with lab(scenario={"plant": {"payload_kg": 0.3}}) as here:
         here.running()
         ball = here.memory.tip.x + np.array([0.0, 0.18, 0.0])
         here.step(seen(sphere("ball", ball, 0.06)))
         watched, tau = Watched(here), np.zeros(here.robot.n)
-        for k in range(3000):
+        for k in range(2000):
             if k % 80 == 0:
                 tau = rng.uniform(-1.0, 1.0, here.robot.n) * here.robot.tau_max
             watched.step(drive(tau))
@@ -101,7 +100,7 @@ def test_a_law_that_pushes_each_joint_to_its_end_harms_nothing(sign: float):
     with lab() as here:
         here.running()
         watched = Watched(here)
-        for _ in range(2500):
+        for _ in range(1800):
             watched.step(drive(sign * here.robot.tau_max))
         watched.harmed_nothing()
 

@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
 SIMULATES = ("3.11",)  # pybullet has no wheel for later ones
 EXTRAS = "sim,plan,report,rover,view"
-IMPORTS = "import pinocchio, coal, numba, ompl, viser, foxglove, pymavlink, matplotlib, pyarrow, rtctl; print(rtctl.__version__)"
+MODULES = "pinocchio, coal, numba, ompl, viser, foxglove, pymavlink, matplotlib, pyarrow, rtctl"
+IMPORTS = f"import {MODULES}; print(rtctl.__version__)"
 FIRST = (
     ("-c", IMPORTS),
     ("-m", "rtctl", "--help"),

@@ -67,7 +67,7 @@ def _client(workers: int, scheduler: str) -> Iterator[Any]:
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # any free port: None is the one that another campaign has
                 local_directory=folder,
                 silence_logs=logging.CRITICAL,
                 memory_limit=0,

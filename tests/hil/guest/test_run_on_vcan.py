@@ -107,7 +107,8 @@ def test_a_second_controller_on_the_interface_is_refused(rig: Beside, controller
     second = rig.launch()
     assert second.wait() == EXIT_CONFIG
     assert second.text.count("\n") == 1
-    assert f"in use by process {controller.popen.pid}, wanted one rtctl per bus" in second.text
+    assert f"in use by process {controller.popen.pid} of user " in second.text
+    assert "wanted one rtctl per bus" in second.text
     assert rig.status()["state"] == "RUN"
 
 
