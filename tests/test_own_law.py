@@ -176,6 +176,52 @@ def test_a_law_that_has_nothing_to_say_leaves_it_to_this_program(tmp_path: Path)
     assert other["digest"] == own["digest"]
 
 
+def spoil(value: Any) -> None:
+    """Write nonsense into whatever can be reached."""
+    if isinstance(value, np.ndarray):
+        if value.flags.writeable:
+            value.view(np.uint8)[...] = 0x7F
+    elif isinstance(value, tuple):
+        for part in value:
+            spoil(part)
+    elif hasattr(value, "__struct_fields__"):
+        for name in value.__struct_fields__:
+            spoil(getattr(value, name))
+
+
+def test_a_law_that_writes_into_what_it_is_shown_spoils_nothing(tmp_path: Path):
+    (tmp_path / "scene.toml").write_text(SCENE)
+
+    def law(robot: Any, memory: Any, feedback: Any) -> None:
+        q = memory.joints.q
+        q -= 1.0  # as is soon written
+        spoil((robot, memory, feedback))
+
+    spoilt = rtctl.simulate(tmp_path / "scene.toml", law=law)
+    assert spoilt["digest"] == rtctl.simulate(tmp_path / "scene.toml")["digest"]
+
+
+@pytest.mark.parametrize("verb", [Verb.NONE, Verb.FLOAT, Verb.HOLD, Verb.PARK, Verb.STOP])
+@pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit])
+def test_whatever_is_asked_when_it_raises_the_arm_stops(verb: Verb, error: type[BaseException]):
+    with lab() as here:
+        here.running()
+
+        def law(robot: Any, memory: Any, feedback: Any) -> F64:
+            if memory.tick >= broken:
+                raise error
+            return 0.3 * robot.tau_max
+
+        broken = here.memory.tick + 300
+        here.servo.drive_by(law)
+        for k in range(301):
+            here.step(Request(verb) if k == 300 else Request())
+        assert np.abs(here.simulator.truth().qd).max() > 0.1
+        here.run(0.6)
+        assert here.memory.state == State.SAFE_STOP
+        assert np.abs(here.simulator.truth().qd).max() < 0.02
+
+
 def test_a_log_of_it_replays_to_the_bit(tmp_path: Path):
     (tmp_path / "scene.toml").write_text(SCENE)
     rng = np.random.default_rng(3)

@@ -176,6 +176,27 @@ def test_who_joins_a_run_late_sees_what_is_new(log: Path, tmp_path: Path) -> Non
     assert all(-1e-6 <= sent - LAG - 1e-9 * (m.time - newest) < 0.006 for sent, m in gone)
 
 
+def test_a_hole_in_a_finished_log_is_not_waited_for(log: Path) -> None:
+    followed = Tail(log, TOPICS)
+    relay = Relay(followed, "127.0.0.1", 0)
+    messages, begin, gone = followed.read_on().messages[:6], 1e6, 0
+    holed = [m._replace(time=m.time + k // 3 * round(3.6e12)) for k, m in enumerate(messages)]
+    last = messages[-1]._replace(time=(1 << 63) - 1)  # as the reader gives times that mean nothing
+    relay.add([*holed, last], begin)
+    try:
+        for step in range(600):
+            gone += len(list(relay._due(begin + 0.005 * step)))
+    finally:
+        relay.close()
+    assert gone == 7
+
+
+@pytest.mark.parametrize("words", [["--port", "9000"], ["--host", "0.0.0.0"]])
+def test_where_nothing_listens_an_address_is_refused(log: Path, capsys: pytest.CaptureFixture[str], words: list[str]):
+    assert main(["log", "tail", str(log), *words]) == 2
+    assert "wanted --foxglove beside it" in capsys.readouterr().err
+
+
 def test_the_command_names_the_address_and_ends_with_the_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "tail", str(log), "--foxglove", "--port", "0"]) == 0
     out, err = capsys.readouterr()

@@ -117,7 +117,8 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         adviser = stack.enter_context(closing(vehicle.adviser(robot, lockstep)))  # a fork: the thread has ended
         recorder = _recorder(setup.log, header._replace(extra=told), how.path)
         servo = Servo(vehicle, robot, link, recorder, start, dry)
-        servo.law = how.law
+        if how.law is not None:
+            servo.drive_by(how.law)
         queue = GoalQueue()
         console.publish(
             lambda: {**status(servo, recorder), **queue.status()},

@@ -4,13 +4,20 @@ import importlib.util
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar, cast
+
+import msgspec
+import numpy as np
 
 from rtctl.errors import RtctlError, UsageError
 from rtctl.spell import nearest
-from rtctl.types import F64
+from rtctl.types import F64, Array
 
 AnyLaw: TypeAlias = Callable[..., Sequence[float] | F64 | None]  # `rtctl.app.servo.Law` of any vehicle
+
+
+SMALL = 1 << 16  # [bytes] an array of more is shown as it is, read-only: meshes, clouds
+T = TypeVar("T")
 
 
 class OwnLawError(RtctlError):
@@ -31,7 +38,7 @@ def load_law(text: str) -> AnyLaw:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UsageError(f"--law: {file} cannot be run: {raised(error)}") from error
     law = getattr(module, name, None)
     if not callable(law):
@@ -41,7 +48,29 @@ def load_law(text: str) -> AnyLaw:
     return found
 
 
-def raised(error: Exception) -> str:
+def private(value: T) -> T:
+    """Return a value with arrays of its own wherever it has any: whoever writes into them changes nothing else.
+
+    `q = memory.joints.q; q -= goal` is soon written, and would be what the controller believes from then on.
+    """
+    shown: object = value
+    if isinstance(value, np.ndarray):
+        shown = value.copy() if value.nbytes <= SMALL else _sealed(value)
+    elif isinstance(value, tuple):
+        parts = map(private, value)
+        shown = type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    elif isinstance(value, msgspec.Struct):
+        shown = type(value)(*(private(getattr(value, name)) for name in value.__struct_fields__))
+    return cast(T, shown)
+
+
+def _sealed(array: Array) -> Array:
+    seen = array.view()
+    seen.flags.writeable = False
+    return seen
+
+
+def raised(error: BaseException) -> str:
     """Return what an exception says, and the line that raised it."""
     text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     if isinstance(error, SyntaxError):

@@ -5,17 +5,18 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeAlias
 
-from rtctl.app.own_law import raised
+from rtctl.app.own_law import private, raised
 from rtctl.app.vehicle import C, Event, F, Link, M, R, Said, Sink, Turn, Vehicle
 from rtctl.hal.clock import Slot
 from rtctl.log.entry import Kind
 from rtctl.log.record import checkpoint
 from rtctl.log.record.health import Repeats
 from rtctl.log.record.requests import encode_event, encode_request
-from rtctl.types import F64, Frames, Record, Request, Verb
+from rtctl.types import F64, Frames, Record, Request, State, Verb
 
 TICK, EVENT, REQUEST, CHECKPOINT = int(Kind.TICK), int(Kind.EVENT), int(Kind.REQUEST), int(Kind.CHECKPOINT)
 QUIET = Request()
+ENDS = (Verb.STOP, Verb.DISARM, Verb.DROP, Verb.TERM)  # verbs that end a motion by themselves
 Law: TypeAlias = Callable[[R, M, F], Sequence[float] | F64 | None]  # a law of one's own; see `sim.simulate`
 
 
@@ -50,7 +51,12 @@ class Servo(Generic[R, M, F, C]):
         self.lateness = 0.0  # [s] of this wake-up
         self.flags = 0  # types.Link bits that only the daemon knows
         self.law: Law[R, M, F] | None = None  # drives the arm in place of this program's own
-        self.failure: Exception | None = None  # that it raised
+        self._shown = robot  # to that law
+        self.failure: BaseException | None = None  # that it raised
+
+    def drive_by(self, law: Law[R, M, F]) -> None:
+        """Have somebody's own law drive the arm from the next turn on."""
+        self.law, self._shown = law, private(self.robot)
 
     def turn(self, slot: Slot, request: Request) -> Turn[F, C]:
         """Read, decide, write, record."""
@@ -84,12 +90,13 @@ class Servo(Generic[R, M, F, C]):
     def _driven(self, law: Law[R, M, F], feedback: F, request: Request) -> Request:
         """Return the request with the torque of another law; one that raised is never asked again: the arm stops."""
         try:
-            tau = law(self.robot, self.memory, feedback)
+            tau = law(self._shown, private(self.memory), private(feedback))
             return request if tau is None else request._replace(drive=tuple(map(float, tau)))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.law, self.failure = None, error
             self.notes.append(("law", raised(error)))
-            return request if request.verb else request._replace(verb=Verb.STOP)
+            moves = self.memory.state == State.RUN and request.verb not in ENDS
+            return request._replace(verb=Verb.STOP) if moves else request
 
     def _log(self, record: Record, frames: Sequence[bytes], request: Request, events: list[Event]) -> None:
         if self.sink is None:

@@ -96,7 +96,8 @@ def simulate_scenario(
             )
             sinks.append(live)
         servo = Servo(vehicle, robot, link, _sink(sinks), start, stamp=lambda now: round(now * 1e9))
-        servo.law = law
+        if law is not None:
+            servo.drive_by(law)
         if live is not None and shown is not None:
             live.serve(servo)
             shown(live.ring)

@@ -75,8 +75,8 @@ def add(commands: Commands) -> None:
     tail.add_argument("--every", metavar="S", type=positive, default=1.0, help="between two states (%(default)s s)")
     tail.add_argument("--for", dest="seconds", metavar="S", type=positive, default=float("inf"), help="then stop")
     tail.add_argument("--foxglove", action="store_true", help="let Foxglove draw it: links, obstacles, goal, events")
-    tail.add_argument("--host", metavar="H", default="127.0.0.1", help="of --foxglove (%(default)s)")
-    tail.add_argument("--port", metavar="P", type=port, default=8765, help="of --foxglove; 0: any free (%(default)s)")
+    tail.add_argument("--host", metavar="H", help="of --foxglove (127.0.0.1)")
+    tail.add_argument("--port", metavar="P", type=port, help="of --foxglove; 0: any free (8765)")
     pictures.add(actions)
     replays.add(actions)
     identify.add(actions)
@@ -246,6 +246,8 @@ def _mavlink(arguments: argparse.Namespace) -> int:
 def _tail(arguments: argparse.Namespace) -> int:
     from rtctl.log.read.follow import Tail, newest
 
+    if not arguments.foxglove and (arguments.host is not None or arguments.port is not None):
+        raise UsageError("log tail: got --host or --port, wanted --foxglove beside it: nothing else listens")
     path = Path(arguments.path)
     path = newest(path) if path.is_dir() else path
     if not arguments.foxglove:
@@ -254,7 +256,7 @@ def _tail(arguments: argparse.Namespace) -> int:
     from rtctl.cli.relay import TOPICS, Relay
 
     followed = Tail(path, TOPICS)
-    relay = Relay(followed, arguments.host, arguments.port)
+    relay = Relay(followed, arguments.host or "127.0.0.1", 8765 if arguments.port is None else arguments.port)
     try:
         print(f"rtctl: {relay.url}: in Foxglove, Open connection, Foxglove WebSocket  (Ctrl-C ends)", file=sys.stderr)
         return _follow(arguments, followed, relay)
