@@ -118,7 +118,8 @@ def _demo(args: argparse.Namespace, voice: Voice) -> int:
         head = (
             f"{scenario.robot}: {len(scenario.goal)} goals, {len(scenario.obstacle)} obstacles, "
             f"{scenario.duration_s:g} s, over {args.interface}\n"
-            f"in {out}: the robot file of this run, outputs, log and plot"
+            f"in {out}: the robot file of this run, outputs, log and plot\n"
+            "nearest: by the controller's spheres, which stand out of the links; at the end: by the simulator"
         )
         for lockstep in modes:
             last = lockstep or args.realtime

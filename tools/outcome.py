@@ -235,7 +235,7 @@ def _goals(outcome: Outcome) -> Table:
 
 
 def _obstacles(outcome: Outcome) -> Table:
-    table = _table("obstacle", "smallest clearance")
+    table = _table("obstacle", "smallest clearance, by the simulator")
     for name, d in outcome.clearance.items():
         text = f"over {PLENTY * 1e3:.0f} mm" if d >= PLENTY else f"{d * 1e3:.1f} mm"
         table.add_row(name, Text(text, style="bold red" if d <= 0.0 else ""))

@@ -252,20 +252,23 @@ def prepare(config: str, strict: bool = False, lobby: "Lobby | None" = None) -> 
     say("rtctl: compiling what is not compiled yet; it is kept for the next time", ERR)
     from rtctl.cli.progress import bar
 
-    total, printed = warm.kernels(), time.monotonic()
+    total, begun = warm.kernels(), time.monotonic()
+    printed, compiled = begun, 0
 
     def told(done: int) -> None:
-        nonlocal printed
+        nonlocal printed, compiled
+        compiled = done
         draw(min(done, total))
         if lobby is not None:
             lobby.tell("compiling what is not compiled yet", done, total)
         if not sys.stderr.isatty() and time.monotonic() - printed > 5.0:
             printed = time.monotonic()
-            say(f"rtctl: compiled {done} of at most {total} kernels", ERR)
+            say(f"rtctl: compiled {done} of at most {total} kernels in {printed - begun:.0f} s", ERR)
 
     try:
         with bar("compiling", total) as draw:
             warm.warm(config, told)
+        say(f"rtctl: compiled {compiled} kernels in {time.monotonic() - begun:.0f} s; that was all", ERR)
     except RtctlError:
         if strict:
             raise

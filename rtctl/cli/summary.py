@@ -80,7 +80,7 @@ def _goals(result: Json) -> Table:
 
 
 def _clearances(result: Json) -> Table:
-    table = _table("obstacle", "smallest clearance")
+    table = _table("obstacle", "smallest clearance, by the simulator")
     found = result.get("min_clearance_m") or {}
     for name, distance in found.items():
         if name != "all":
