@@ -242,7 +242,7 @@ def repelled(o: Obstacles, P: F64, radius: F64, prefilter: bool = True, seed: in
     B = np.einsum("jid,de,jke->jik", Jp, A_inv, Jp).copy()
     out, link = field_buffers(o.active.shape[0], m, n), np.sort(rng.integers(1, n + 1, m))
     flags = field(
-        MovingPoints(P, Jp, B, radius, link), np.zeros(n), rng.normal(size=n) * 0.3, o, PARAMS, out, True, prefilter
+        MovingPoints(P, Jp, B, radius, link), np.zeros(n), rng.normal(size=n) * 0.3, o, PARAMS, out, prefilter
     )
     return [a.tobytes() for a in (out.tau, out.rho_min, out.nearest, out.force)], out.tau.copy(), int(flags)
 
@@ -275,7 +275,6 @@ def test_one_that_appears_on_the_arm_pushes_out_with_a_bounded_force(kind: str) 
             o,
             PARAMS,
             out,
-            True,
             True,
         )
         rho, n = distance(shape, x[None], MESHES)

@@ -44,7 +44,7 @@ def flight(table: Obstacles, p: FieldParams, speed: float, offset: float, dt: fl
     one, link = EYE.reshape(1, 3, 3), np.ones(1, np.int64)
     least = most = 0.5 * speed * speed
     for _ in range(round(1.2 / speed / dt)):
-        field(MovingPoints(x.reshape(1, 3), one, one, np.zeros(1), link), ZERO, v, table, p, out, True, True)
+        field(MovingPoints(x.reshape(1, 3), one, one, np.zeros(1), link), ZERO, v, table, p, out, True)
         v, x = v + dt * a, x + dt * v + 0.5 * dt * dt * a
         a = out.tau.copy()  # acts a period after what it was computed from
         energy = 0.5 * float(v @ v) + potential(float(out.rho_min[0]), p)

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from rtctl import experiment
 from rtctl.cli import main
 from rtctl.control.firas import field_params
-from rtctl.experiment import bounce, enclosure, limits, line, minimum, moving, potential, puma, rates
+from rtctl.experiment import bounce, enclosure, forms, limits, line, minimum, moving, potential, puma, rates
 from rtctl.experiment.mass import Mass, motion_params, obstacles_of
 from rtctl.experiment.outline import Figurine
 from rtctl.experiment.style import styled
@@ -194,6 +194,19 @@ def test_the_papers_rates_work_and_the_estimator_is_worth_its_name():
     assert carried["tip_error_rms_m"] < 0.5 * held["tip_error_rms_m"]
     assert "| 225 / 100 | yes |" in rates.table(data)
     drawn(rates, data)
+
+
+def test_the_papers_forms_are_compared_and_play():
+    data = forms.run(samples=150, forms=(("sum", "task"),), lasts=2.6)
+    numbers = forms.figures(data)
+    assert numbers["samples"] > 130
+    assert 2.5 < numbers["sum_over_blend"]["median"] < 5.0
+    assert 5.0 < numbers["task_to_normal_deg"]["median"] < 20.0
+    assert [run["form"] for run in numbers["runs"]] == ["sum, task"]
+    assert numbers["runs"][0]["arrived"]
+    assert numbers["runs"][0]["contacts"] == 0
+    assert 0.02 < numbers["runs"][0]["min_clearance_m"] < 0.06
+    drawn(forms, data)
 
 
 def drawn(module, data) -> None:

@@ -15,6 +15,7 @@ import pytest
 from rtctl.arm.field import (
     CAPPED,
     CONTACT,
+    SUM,
     Field,
     FieldParams,
     LimitParams,
@@ -83,7 +84,8 @@ def run(
     buffers = field_buffers(o.active.shape[0], p.radius.shape[0], p.Jp.shape[2])
     for a in buffers:
         a.fill(7)  # whatever an earlier call left must not matter
-    flags = field(p, np.zeros_like(qd), qd, o, params, buffers, blend, prefilter)
+    used = params._replace(forms=float(params.forms if blend else int(params.forms) | SUM))
+    flags = field(p, np.zeros_like(qd), qd, o, used, buffers, prefilter)
     return buffers, int(flags)
 
 
@@ -136,7 +138,7 @@ def bounce(params: FieldParams, dt: float, delay: int, speed: float = V, wall: f
     p, buffers, qd = masses(np.zeros((1, 3))), field_buffers(2, 1, 3), np.zeros(3)
     for _ in range(int(4 / dt)):
         p.P[0, 2], qd[2] = z, v
-        field(p, np.zeros_like(qd), qd, o, params, buffers, True, True)
+        field(p, np.zeros_like(qd), qd, o, params, buffers, True)
         late.append(float(buffers.tau[2]))
         v += late.pop(0) * dt
         z += v * dt
@@ -347,7 +349,7 @@ def test_a_mass_at_rest_flees_from_an_approaching_wall() -> None:
     )
     for _ in range(3000):
         p.P[0, 2], qd[2] = z, v
-        field(p, np.zeros_like(qd), qd, o, DAMPED, buffers, True, True)
+        field(p, np.zeros_like(qd), qd, o, DAMPED, buffers, True)
         v += late * DT
         late = float(buffers.tau[2])
         z += v * DT

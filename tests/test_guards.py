@@ -249,9 +249,7 @@ def beside_wall(x: float, v: float) -> tuple[MovingPoints, Field]:
     wall = with_shape(obstacles_empty(2), 0, Shape("wall", "plane", np.zeros(4), ZERO, upright, ZERO, ZERO))
     point = MovingPoints(np.array([[x, 0.0, 0.0]]), np.eye(3)[None], np.eye(3)[None], np.zeros(1), np.ones(1, np.int64))
     seen = field_buffers(2, 1, 3)
-    field(
-        point, ZERO, np.array([v, 0.0, 0.0]), wall, field_params(0.5, 0.1, 0.02, 1e-3, 0.7, 0.0, 50.0), seen, True, True
-    )
+    field(point, ZERO, np.array([v, 0.0, 0.0]), wall, field_params(0.5, 0.1, 0.02, 1e-3, 0.7, 0.0, 50.0), seen, True)
     return point, seen
 
 
@@ -283,7 +281,7 @@ def crowd(seed: int, slots: int = 24) -> tuple[Model, MovingPoints, Field, F64, 
         table = with_shape(table, k, sphere(str(k), (model.P[j] + away).tolist(), 0.02))
     points = MovingPoints(model.P, model.Jp, model.B, arm.points.radius, arm.points.link)
     seen = field_buffers(slots, len(arm.points.radius), 7)
-    field(points, np.zeros(7), qd, table, arm.avoid, seen, True, True)
+    field(points, np.zeros(7), qd, table, arm.avoid, seen, True)
     return model, points, seen, qd, arm.tau_rate
 
 

@@ -123,7 +123,7 @@ def test_the_whole_potential_has_its_minimum_at_the_goal():
     assert rho.min() == pytest.approx(0.03, abs=1e-3)
 
     def push(dq: np.ndarray, goal: Ends) -> np.ndarray:
-        field_to(points, dq, still, obstacles, arm.avoid, out, True, True, goal)
+        field_to(points, dq, still, obstacles, arm.avoid, out, True, goal)
         return out.tau.copy()
 
     nowhere = Ends(np.zeros((0, 3)), np.zeros((0, 0)), 0.0, APART, 0.0, np.zeros(0))

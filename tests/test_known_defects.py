@@ -141,7 +141,7 @@ def push_depends_on_the_gap_alone() -> bool:
         at = np.array([[radius + 0.04, 0.0, 0.0]])
         eye = np.eye(3).reshape(1, 3, 3)
         points = law.MovingPoints(at, eye, eye, np.zeros(1), np.ones(1, np.int64))
-        law.field_to(points, ZERO, ZERO, table, p, out, True, True, law.nothing_ahead(robot()).ends)
+        law.field_to(points, ZERO, ZERO, table, p, out, True, law.nothing_ahead(robot()).ends)
         forces.append(out.tau[0])
     wanted = p.eta * (1.0 / 0.04 - 1.0 / p.rho0) / 0.04**2
     return bool(np.allclose(forces, wanted, rtol=1e-9))

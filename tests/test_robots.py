@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -198,6 +199,21 @@ def test_the_puma_s_motors_are_those_of_the_table():
     np.testing.assert_allclose([j.friction_Nms_rad for j in joints], PUMA_FRICTION * PUMA_GEARS**2, rtol=1e-3)
 
 
+def test_the_puma_of_1986_is_the_other_but_for_its_motors():
+    """Armstrong, Khatib and Burdick 1986, motor and drive inertia: their own table; all of it in A(q)."""
+    motors = [1.14, 4.71, 0.827, 0.200, 0.179, 0.193]
+    old, new = cfg.load(config_of("puma560_1986")), cfg.load(config_of("puma560"))
+    assert [j.armature_kg_m2 for j in old.robot.joints] == motors
+    plain = [msgspec.structs.replace(j, armature_kg_m2=0.0) for j in old.robot.joints]
+    assert plain == [msgspec.structs.replace(j, armature_kg_m2=0.0) for j in new.robot.joints]
+    assert old.robot.urdf == new.robot.urdf
+    assert (old.motion, old.avoid, old.safety) == (new.motion, new.avoid, new.safety)
+    more = np.diag(np.array(motors) - PUMA_MOTORS * PUMA_GEARS**2)
+    for q in postures("puma560", 3):
+        np.testing.assert_allclose(model_at("puma560_1986", q).A, model_at("puma560", q).A + more, atol=2e-5)
+    assert report(old, arm("puma560_1986")).warnings == report(new, arm("puma560")).warnings
+
+
 def test_compiled_code_sees_one_layout_of_constants_whatever_the_arm():
     """numba's cache would run the law of one arm for another: it numbers record types anew in each process."""
     assert len({arm(name).constants.dtype for name in NAMES}) == 1
@@ -206,7 +222,7 @@ def test_compiled_code_sees_one_layout_of_constants_whatever_the_arm():
 # ---- plant
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "puma560_1986"])
 def test_the_plant_accelerates_as_pinocchio_does_with_motors_and_friction(name: str):
     body, settings = arm(name).body, load_settings(config_of(name))
     armature = np.array([j.armature for j in settings.joints])
@@ -322,6 +338,7 @@ RUNS: dict[str, tuple[list[float], dict[str, Any]]] = {
         {"type": "cylinder", "radius_m": 0.05, "length_m": 0.4, "position_m": [0.98, 1.12, 0]},
     ),
     "puma560": ([0.58, 0.15, 1.05], {"type": "sphere", "radius_m": 0.06, "position_m": [0.72, 0.02, 1.12]}),
+    "puma560_1986": ([0.58, 0.15, 1.05], {"type": "sphere", "radius_m": 0.06, "position_m": [0.72, 0.02, 1.12]}),
     "ur5": ([0.50, 0.35, 0.28], {"type": "box", "size_m": [0.08, 0.08, 0.3], "position_m": [0.66, 0.24, 0.2]}),
     "openarm_e2e": (
         [0.1, 0.32, 0.25],
@@ -330,7 +347,7 @@ RUNS: dict[str, tuple[list[float], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "puma560_1986"])
 def test_it_reaches_a_goal_past_an_obstacle_within_every_limit(name: str):
     goal, obstacle = RUNS[name]
     scenario = {"duration_s": 2.6, "goal": [{"at_s": 0.3, "position_m": goal}], "obstacle": [{"name": "o", **obstacle}]}

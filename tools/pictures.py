@@ -62,13 +62,29 @@ def played(scenario: Path, folder: Path) -> tuple[Json, Path]:
 
 def experiments(folder: Path) -> dict[str, Made]:
     """Make the pictures of the paper's experiments, and the table of the rates."""
-    made = {}
+    made: dict[str, Made] = {}
     for name in experiment.NAMES:
-        experiment.perform(name, folder, lambda part: None)
-        shutil.copy(folder / f"{name}.png", DOCS)
-        made[f"{name}.png"] = Made(f"rtctl experiment {name}", [])
+        made |= experiment_of(name, folder)
     shutil.copy(folder / "rates.md", DOCS)
     return made
+
+
+def forms(folder: Path) -> dict[str, Made]:
+    """Make the picture of the repulsion's forms alone."""
+    return experiment_of("forms", folder)
+
+
+def experiment_of(name: str, folder: Path) -> dict[str, Made]:
+    """Make the picture of one experiment."""
+    figures = experiment.perform(name, folder, lambda part: None)
+    shutil.copy(folder / f"{name}.png", DOCS)
+    says = []
+    if name == "forms":
+        says = [
+            f"{figures['sum_over_blend']['median']:.1f} times as hard",
+            f"{figures['task_to_normal_deg']['median']:.0f} degrees",
+        ]
+    return {f"{name}.png": Made(f"rtctl experiment {name}", says)}
 
 
 def report(folder: Path) -> dict[str, Made]:
@@ -181,6 +197,7 @@ def in_foxglove(folder: Path) -> dict[str, Made]:
 
 PARTS: dict[str, Callable[[Path], dict[str, Made]]] = {
     "experiments": experiments,
+    "forms": forms,
     "report": report,
     "rover": rover,
     "view": view,

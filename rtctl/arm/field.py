@@ -5,18 +5,27 @@
 with a, d of `firas`, the true distance rho and its unit normal n = d rho/d p. lambda a is the force that gives the
 point the acceleration a along n. Below 1/m_max = b0 the mobility b = n^T J A^-1 J^T n gives lambda = b/b0^2, which goes
 to zero: a point that hardly moves cannot flee, and the arm is not to be flung about for it. So no pair exceeds
-2 m_max a(rho_num). An obstacle that
-comes towards a point widens rho0 by its own speed along n times the look-ahead. Its own, not the closing speed: the
-arm's motion would otherwise feed back into the zone and break the energy balance that eta comes from.
+2 m_max a(rho_num).
+
+The points of a link share one repulsion by default: each term is weighted by its part of their sum of a (`blend`). The
+paper's own forms may be chosen instead: the plain sum (`SUM`), and f = Lambda_j (a + d) n with the whole inertia of the
+point (`TASK`, see `point_inertia`).
+
+An obstacle that comes towards a point widens rho0 by its own speed along n times the look-ahead. Its own, not the
+closing speed: the arm's motion would otherwise feed back into the zone and break the energy balance that eta comes
+from.
 """
 
 import math
 from typing import NamedTuple
 
 from rtctl.arm.joint_field import LEAST_REACH, joint_limit_field, own_field, self_collision
+from rtctl.arm.point_inertia import times_inertia
 from rtctl.control.firas import (
     CAPPED,
     CONTACT,
+    SUM,
+    TASK,
     Field,
     FieldParams,
     LimitParams,
@@ -34,6 +43,8 @@ from rtctl.world.primitives import Obstacles, distances_into, speed_bound
 __all__ = [
     "CAPPED",
     "CONTACT",
+    "SUM",
+    "TASK",
     "Field",
     "FieldParams",
     "LimitParams",
@@ -129,13 +140,14 @@ def _load(B: F64, X: F64) -> None:
 def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: Ends) -> None:
     """Write a and lambda (a + d) of every near point against the obstacle in slot k, zero of the others.
 
+    With TASK a + d alone: its inertia is no number, see `_add_forces`.
     What moves keeps its whole influence: it will not be where it is now.
     rho_dot = n . (point velocity - surface velocity); the surface point is x = P - rho n, and n . (w x n) = 0.
     """
     p, v, w, points, pairs = obstacles.p, obstacles.v, obstacles.w, out.points, out.pairs
     rho0, rho_min, rho_num, eta, k_d = params.rho0, params.rho_min, params.rho_num, params.eta, params.k_d
     look_ahead, soft, floor = params.look_ahead, params.v_smooth, 1.0 / params.m_max
-    heavy = params.m_max * params.m_max
+    heavy, whole = params.m_max * params.m_max, int(params.forms) & TASK != 0
     px, py, pz, vx, vy, vz, wx, wy, wz = p[k, 0], p[k, 1], p[k, 2], v[k, 0], v[k, 1], v[k, 2], w[k, 0], w[k, 1], w[k, 2]
     rests = vx == 0.0 and vy == 0.0 and vz == 0.0 and wx == 0.0 and wy == 0.0 and wz == 0.0
     near_goal = rests and ends.P.shape[0] > 0
@@ -158,7 +170,7 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: 
         b = x * x * points[_B, j] + y * y * points[_B + 1, j] + z * z * points[_B + 2, j]
         b += 2.0 * (x * y * points[_B + 3, j] + x * z * points[_B + 4, j] + y * z * points[_B + 5, j])
         pairs[k, ACCELERATION, j] = a
-        pairs[k, FORCE, j] = (a + d) * (b * heavy if b <= floor else 1.0 / b)
+        pairs[k, FORCE, j] = (a + d) * (1.0 if whole else b * heavy if b <= floor else 1.0 / b)
 
 
 @leaf_kernel
@@ -224,10 +236,11 @@ def _gather(k: int, link: I64, rho_num: float, out: Field) -> int:
 
 
 @leaf_kernel
-def _add_forces(k: int, link: I64, blend: bool, out: Field) -> None:
-    """Add the forces of slot k on the points, blended over the points of each link."""
+def _add_forces(k: int, link: I64, params: FieldParams, out: Field) -> None:
+    """Add the forces of slot k on the points, blended over the points of each link, or plainly."""
     pairs, points, leader = out.pairs, out.points, out.leader[k]
     fx, fy, fz = 0.0, 0.0, 0.0
+    blend, whole, floor = int(params.forms) & SUM == 0, int(params.forms) & TASK != 0, 1.0 / params.m_max
     for i in range(out.near_count[k]):
         j = out.near[k, i]
         f = pairs[k, FORCE, j]
@@ -236,6 +249,8 @@ def _add_forces(k: int, link: I64, blend: bool, out: Field) -> None:
         if blend:
             f *= pairs[k, ACCELERATION, j] / out.share[leader, link[j]]
         x, y, z = f * pairs[k, NORMAL, j], f * pairs[k, NORMAL + 1, j], f * pairs[k, NORMAL + 2, j]
+        if whole:
+            x, y, z = times_inertia(points, j, x, y, z, floor)
         fx, fy, fz = fx + x, fy + y, fz + z
         points[_F, j] += x
         points[_F + 1, j] += y
@@ -278,12 +293,11 @@ def field(
     obstacles: Obstacles,
     params: FieldParams,
     out: Field,
-    blend: bool,
     prefilter: bool,
 ) -> int:
     """Return `field_to` no posture in particular."""
     nowhere = Ends(points.P[:0], out.share[:0], 0.0, APART, 0.0, out.tau[:0])
-    return field_to(points, dq, qd, obstacles, params, out, blend, prefilter, nowhere)
+    return field_to(points, dq, qd, obstacles, params, out, prefilter, nowhere)
 
 
 @leaf_kernel
@@ -294,15 +308,15 @@ def field_to(
     obstacles: Obstacles,
     params: FieldParams,
     out: Field,
-    blend: bool,
     prefilter: bool,
     ends: Ends,
 ) -> int:
     """Repulsion of the points from the obstacles; writes all of `out` (Khatib 1986, eq. 18 to 21).
 
     dq: (n,) [rad] since the points were evaluated; qd: (n,).
-    blend: per link and obstacle the terms are weighted with a_j / sum a_j, so that a link covered by many spheres
-    feels one repulsion; False: the paper's plain sum. prefilter: False measures every pair exactly, to the same bits.
+    params.forms: without SUM the terms of a link and obstacle are weighted with a_j / sum a_j, so that a link covered
+    by many spheres feels one repulsion; with TASK a point's force is its whole Lambda a n, else the least that gives it
+    the acceleration a along n. prefilter: False measures every pair exactly, to the same bits.
     ends: influences shrink towards what the points have there, see `_reach`.
     Returns flags CAPPED | CONTACT.
     """
@@ -323,6 +337,6 @@ def field_to(
             flags |= _gather(k, points.link, params.rho_num, out)
     for k in range(slots):
         if out.leader[k] >= 0:
-            _add_forces(k, points.link, blend, out)
+            _add_forces(k, points.link, params, out)
     _add_torques(points.Jp, out.points, out.tau)
     return flags

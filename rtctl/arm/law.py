@@ -288,6 +288,7 @@ def _params(c: RecordRow, n: int) -> _Params:
             c.avoid_look_ahead,
             c.avoid_v_smooth,
             c.avoid_m_max,
+            c.avoid_forms,
         ),
         FieldParams(
             c.own_rho0,
@@ -298,6 +299,7 @@ def _params(c: RecordRow, n: int) -> _Params:
             c.own_look_ahead,
             c.own_v_smooth,
             c.own_m_max,
+            c.own_forms,
         ),
         LimitParams(
             c.limit_rho0[:n],
@@ -429,7 +431,7 @@ def _torques(
         w[_DQ, i], w[_DIAGONAL, i], w[_LOAD, i] = q[i] - model.q[i], model.A[i, i], model.g[i] + model.h[i]
     dq, load, tau_max = w[_DQ], w[_LOAD], limits.tau_max
     points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
-    flags = field_to(points, dq, qd, obstacles, p.avoid, seen, True, True, ahead.ends)
+    flags = field_to(points, dq, qd, obstacles, p.avoid, seen, True, ahead.ends)
     rho_self, more = self_collision(
         model.own_rho, model.own_row, dq, qd, model.A_inv, p.self_collision, ahead.ends.own, w[_SELF]
     )

@@ -18,6 +18,7 @@ from rtctl.types import F64, I64
 
 CAP_SHARE = 0.5  # of the clearance, where the repulsion is capped at the latest
 CAPPED, CONTACT = 1, 2  # flags: some counted distance below rho_num; at or below 0
+SUM, TASK = 1, 2  # of FieldParams.forms: terms of a link's points added plainly; the whole inertia of a point
 
 
 class FieldParams(NamedTuple):
@@ -31,6 +32,7 @@ class FieldParams(NamedTuple):
     look_ahead: float  # [s] an obstacle's speed towards the point times this widens rho0
     v_smooth: float  # [m/s] below it that widening starts as a parabola
     m_max: float  # [kg] bound of the effective mass lambda
+    forms: float  # SUM and TASK, whichever apply, added; 0: blended, and the mass along the normal
 
 
 class LimitParams(NamedTuple):
@@ -86,20 +88,23 @@ def rho_num_of(eta: float, dt: float) -> float:
     return float((3.0 * eta * dt * dt) ** 0.25)
 
 
-def _derived(v_max: float, rho0: float, rho_min: float, dt: float, damping_ratio: float) -> tuple[float, float, float]:
+def _derived(
+    v_max: float, rho0: float, rho_min: float, dt: float, damping_ratio: float, added: int = 1
+) -> tuple[float, float, float]:
     """Return (where the cap begins, eta, k_d), or raise ValueError unless 0 < rho_num < rho_min < rho0.
 
     The cap begins at CAP_SHARE of the clearance or at rho_num, whichever is larger: closer in no motor follows, and a
-    force that only grows would drown what other obstacles say.
+    force that only grows would drown what other obstacles say. Where so many terms are `added` on one link, its
+    stiffness is their sum, and so is its damping: what the rate can hold is bounded for all of them together.
     """
     if not 0.0 < rho_min < rho0:
         raise ValueError(f"wanted 0 < clearance < influence, got {rho_min} and {rho0}")
     eta = eta_of(v_max, rho0, rho_min)
-    rho_num = rho_num_of(eta, dt)
+    rho_num = rho_num_of(added * eta, dt)
     if not 0.0 < rho_num < rho_min:
         raise ValueError(f"wanted a clearance above rho_num = {rho_num:.4g} (positive) at this rate, got {rho_min}")
     # 0.5/dt: a damper sampled with one period of delay is calm below it.
-    k_d = min(2.0 * damping_ratio * math.sqrt(3.0 * eta) / rho_min**2, 0.5 / dt)
+    k_d = min(2.0 * damping_ratio * math.sqrt(3.0 * eta) / rho_min**2, 0.5 / (added * dt))
     return max(rho_num, CAP_SHARE * rho_min), eta, k_d
 
 
@@ -111,14 +116,17 @@ def field_params(
     damping_ratio: float,
     look_ahead: float,
     m_max: float,
+    forms: int = 0,
+    added: int = 1,
 ) -> FieldParams:
     """Return the parameters that users never tune, from speed, influence and clearance.
 
     v_max [m/s]; rho0, rho_min [m]; dt [s] the servo period; damping_ratio of the critical damping at rho_min;
-    look_ahead [s]; m_max [kg]. Raises ValueError unless 0 < rho_num < rho_min < rho0.
+    look_ahead [s]; m_max [kg]; forms: SUM, TASK; added: how many terms one link may sum.
+    Raises ValueError unless 0 < rho_num < rho_min < rho0.
     """
-    rho_num, eta, k_d = _derived(v_max, rho0, rho_min, dt, damping_ratio)
-    return FieldParams(rho0, rho_min, rho_num, eta, k_d, look_ahead, 0.1 * v_max, m_max)
+    rho_num, eta, k_d = _derived(v_max, rho0, rho_min, dt, damping_ratio, added)
+    return FieldParams(rho0, rho_min, rho_num, eta, k_d, look_ahead, 0.1 * v_max, m_max, float(forms))
 
 
 def limit_params(qd_max: F64, rho0: F64, rho_min: F64, dt: float, damping_ratio: float) -> LimitParams:

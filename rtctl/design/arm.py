@@ -9,7 +9,17 @@ from rtctl.arm.disturbance import GRAVITY
 from rtctl.arm.encoders import SHARE
 from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
-from rtctl.arm.field import FieldParams, LimitParams, field_buffers, field_params, limit_params
+from rtctl.arm.field import (
+    SUM,
+    TASK,
+    FieldParams,
+    LimitParams,
+    eta_of,
+    field_buffers,
+    field_params,
+    limit_params,
+    rho_num_of,
+)
 from rtctl.arm.gripper import Gripper
 from rtctl.arm.law import prepared
 from rtctl.arm.model import NOTHING, Load, Model, RigidBody
@@ -127,13 +137,11 @@ def build(config: Config, path: str | Path) -> Robot:
         obstacles=obstacles,
         meshes=assets.meshes,
         motion=_motion(config),
-        avoid=_field(config, config.avoid.influence_m, config.avoid.clearance_m, 1.0 / config.motion.singular_1_kg),
+        avoid=_obstacle_field(config, points, source),
         postures=config.avoid.posture == "auto",
         plans=config.avoid.plan == "auto",
         escape=config.avoid.escape,
-        self_avoid=_field(
-            config, config.avoid.self_influence_m, config.avoid.self_clearance_m, 1.0 / config.motion.singular_1_kg
-        ),
+        self_avoid=_self_field(config),
         limit=_limit(config),
         **_filters(config, body, home)._asdict(),
         carry=config.estimator.carry,
@@ -358,9 +366,28 @@ def _motion(c: Config) -> MotionParams:
     )
 
 
-def _field(c: Config, rho0: float, rho_min: float, m_max: float) -> FieldParams:
-    dt = 1.0 / c.loop.servo_hz
-    return field_params(c.motion.v_max_m_s, rho0, rho_min, dt, c.avoid.damping_ratio, c.avoid.lookahead_s, m_max)
+def _obstacle_field(c: Config, points: Points, source: str) -> FieldParams:
+    """Return the field of obstacles, the paper's own forms if asked for.
+
+    Raises ConfigError for a clearance that the rate cannot hold where all points of a link are added.
+    """
+    a, v, dt = c.avoid, c.motion.v_max_m_s, 1.0 / c.loop.servo_hz
+    forms = (SUM if a.superposition == "sum" else 0) | (TASK if a.inertia == "task" else 0)
+    added = int(np.bincount(points.link).max()) if forms & SUM else 1
+    rho_num = rho_num_of(added * eta_of(v, a.influence_m, a.clearance_m), dt)
+    if rho_num >= a.clearance_m:
+        why = f"more than rho_num = {rho_num:.3g} of the {added} points of a link together, of this speed and servo_hz"
+        raise ConfigError(name_place(source, "avoid.clearance_m"), a.clearance_m, f'{why}; or superposition = "blend"')
+    m_max = 1.0 / c.motion.singular_1_kg
+    return field_params(
+        v, a.influence_m, a.clearance_m, dt, a.damping_ratio, a.lookahead_s, m_max, forms=forms, added=added
+    )
+
+
+def _self_field(c: Config) -> FieldParams:
+    a, dt, m_max = c.avoid, 1.0 / c.loop.servo_hz, 1.0 / c.motion.singular_1_kg
+    v = c.motion.v_max_m_s
+    return field_params(v, a.self_influence_m, a.self_clearance_m, dt, a.damping_ratio, a.lookahead_s, m_max)
 
 
 def _limit(c: Config) -> LimitParams:

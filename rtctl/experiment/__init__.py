@@ -13,7 +13,7 @@ from types import ModuleType
 from rtctl.errors import UsageError
 from rtctl.plain import Json
 
-NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "minimum", "rates", "bounce")
+NAMES = ("potential", "line", "enclosure", "puma", "limits", "moving", "minimum", "rates", "bounce", "forms")
 DIGITS = 9  # of a number in a JSON file
 
 

@@ -62,7 +62,7 @@ class Mass:
     def push(self, x: F64, v: F64) -> F64:
         """Return the field's force (3,) [N] on the mass."""
         point = MovingPoints(x[None], self.Jp, self.B, self.radius, ONE)
-        field(point, ZERO3, v, self.obstacles, self.params, self.out, True, True)
+        field(point, ZERO3, v, self.obstacles, self.params, self.out, True)
         return self.out.tau.copy()
 
     def fly(

@@ -206,6 +206,14 @@ class Avoid(Table, frozen=True, kw_only=True):
     plan: Annotated[
         Literal["auto", "never"], Meta(description="auto: a planner leads the arm where the law alone does not get on")
     ] = "auto"
+    superposition: Annotated[
+        Literal["blend", "sum"],
+        Meta(description="of a link's points: weighted by their part in its repulsion, or added as in the paper"),
+    ] = "blend"
+    inertia: Annotated[
+        Literal["normal", "task"],
+        Meta(description="of a point: its mass along the normal, or its whole kinetic energy matrix as in the paper"),
+    ] = "normal"
     self_collision: bool = True
     self_influence_m: Annotated[float, Meta(ge=0.005, le=0.5)] = 0.02
     self_clearance_m: Annotated[float, Meta(ge=0.001, le=0.2)] = 0.008
