@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 
 from rtctl import design as cfg
+from rtctl.arm.diagnosis import balance
 from rtctl.arm.field import SUM, TASK, FieldParams, MovingPoints, field, field_buffers
 from rtctl.arm.law import Motion, evaluate_law, nothing_ahead
 from rtctl.arm.model import RigidBody
@@ -20,7 +21,7 @@ from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
 from rtctl.control.firas import eta_of, rho_num_of
 from rtctl.errors import ConfigError
-from rtctl.types import F64, State
+from rtctl.types import F64, State, Status
 from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 from tests.lab import PANDA, play, robot, sphere
 
@@ -328,6 +329,23 @@ def test_the_rate_must_hold_all_points_of_a_link_where_they_are_added(folder: Pa
 
 
 # ---- runs
+
+
+@pytest.mark.parametrize(("superposition", "inertia"), FORMS)
+def test_a_wall_that_holds_the_arm_is_named_whatever_the_form(folder: Path, superposition: str, inertia: str):
+    """In balance the shares of what opposes the drive add up to one: a goal behind a wall, nothing else near."""
+    path = folder / f"held_{superposition}_{inertia}.toml"
+    alone = '[avoid]\nescape = false\nplan = "never"\nposture = "never"\n'
+    path.write_text(path_of(folder, superposition, inertia).read_text().replace("[avoid]\n", alone))
+    wall = {"name": "wall", "type": "box", "size_m": [0.05, 1.5, 1.5], "position_m": [0.75, 0.0, 0.5]}
+    goal = [{"at_s": 0.3, "position_m": [0.85, 0.0, 0.5]}]
+    run = play({"duration_s": 6.0, "goal": goal, "obstacle": [wall]}, path)
+    assert run.figures["contacts"] == 0
+    assert run.memory.status in (Status.LOCAL_MINIMUM, Status.SHADOWED)
+    assert [text.partition(" at ")[0] for text in run.memory.blocked_by] == ["wall"]
+    shares = balance(run.robot, run.memory, run.record["tau_limits"][-1], run.record["tau_wanted"][-1])
+    assert shares.obstacles.sum() + shares.limits.sum() + shares.own == pytest.approx(1.0, abs=0.1)
+
 
 AROUND = {
     "duration_s": 4.0,

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.field import Field, own_field
+from rtctl.arm.field import ACCELERATION, FORCE, NORMAL, SUM, TASK, Field, FieldParams, own_field
 from rtctl.arm.memory import Memory, record_of
+from rtctl.arm.point_inertia import times_inertia
 from rtctl.arm.robot import Robot
 from rtctl.arm.target import leads
 from rtctl.arm.task import error_of, selected, task_error
@@ -118,6 +119,7 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         GoalDrive(F, m.model.J, m.model.A_inv, tau_m),
         OpposingTorques(tau_own, m.tau_obstacles, tau_limits),
         robot.scratch,
+        robot.avoid,
         m.model.Jp,
         robot.points.link,
         LimitGaps(robot.q_max - m.joints.q, m.joints.q - robot.q_min, robot.limit.rho0),
@@ -143,7 +145,13 @@ def _drive(robot: Robot, m: Memory) -> F64:
 
 @kernel
 def _shares(
-    drive: GoalDrive, opposed: OpposingTorques, field: Field, Jp: F64, link: I64, gaps: LimitGaps
+    drive: GoalDrive,
+    opposed: OpposingTorques,
+    field: Field,
+    params: FieldParams,
+    Jp: F64,
+    link: I64,
+    gaps: LimitGaps,
 ) -> tuple[F64, F64, float, float]:
     """Return the fields of `Balance` from `obstacles` to `granted`; Jp (m, 3, n) and link (m,) of the points."""
     F, J, A_inv, tau_m = drive
@@ -161,16 +169,23 @@ def _shares(
     if raw > 0.0:  # a field that asks for more than the motors have was scaled
         scale = norm(tau_obstacles) / raw
     obstacles, limits, own = np.zeros(slots), np.zeros(n), 0.0
+    plain, whole, pairs = int(params.forms) & SUM != 0, int(params.forms) & TASK != 0, field.pairs
+    along = np.empty(3)
     for k in range(slots):
         if field.leader[k] < 0:
             continue
         for j in range(link.shape[0]):
-            f = field.pairs[k, 5, j]
+            f = pairs[k, FORCE, j]
             if f != 0.0:
-                f *= scale * field.pairs[k, 4, j] / field.share[field.leader[k], link[j]]
+                f *= scale if plain else scale * pairs[k, ACCELERATION, j] / field.share[field.leader[k], link[j]]
+                for c in range(3):
+                    along[c] = pairs[k, NORMAL + c, j]
+                if whole:
+                    x, y, z = times_inertia(field.points, j, along[0], along[1], along[2], 1.0 / params.m_max)
+                    along[0], along[1], along[2] = x, y, z
                 for c in range(3):
                     for i in range(n):
-                        obstacles[k] -= f * field.pairs[k, 1 + c, j] * Jp[j, c, i] * qdd[i] / total
+                        obstacles[k] -= f * along[c] * Jp[j, c, i] * qdd[i] / total
     for i in range(n):
         own -= scale * tau_own[i] * qdd[i] / total
         gap = gaps.above[i] if qdd[i] > 0.0 else gaps.below[i]
