@@ -132,6 +132,7 @@ class Task(IntFlag, boundary=STRICT):
     POSE = POSITION | ORIENTATION
 
 
+GOAL_TIMEOUT = 0.25  # [s] of a goal that moves and says nothing else: of ten a second one may be lost
 TOOL_Z = np.array([0.0, 0.0, 1.0])  # writable as every array: a read-only one is another type to compiled kernels
 
 
@@ -145,6 +146,14 @@ class Goal(NamedTuple):
     tolerance_rot: float  # [rad]
     axis: F64 = TOOL_Z  # (3,) unit vector in the tip's frame, for Task.DIRECTION
     posture: F64 | None = None  # (n,) [rad] that the null space takes on the way, None: the robot's own
+    velocity: F64 | None = None  # (3,) [m/s] of a goal that moves
+    omega: F64 | None = None  # (3,) [rad/s]
+    timeout: float | None = None  # [s] for which it holds unless another comes; None: one that moves GOAL_TIMEOUT
+
+    @property
+    def streams(self) -> bool:
+        """Return whether it is one of a stream."""
+        return self.velocity is not None or self.omega is not None or self.timeout is not None
 
 
 class Shape(NamedTuple):

@@ -49,6 +49,7 @@ DEMANDED = {
     "log_degraded": (Severity.LOG, "A"),
     "collision": (Severity.SS2, "R"),
     "collision_hard": (Severity.SS1, "R"),
+    "goal_stale": (Severity.SS2, "A"),
 }
 
 
@@ -125,6 +126,16 @@ def ball_on_goal(near: float) -> Callable[[Arm], list[dict[str, Any]]]:
     return slots
 
 
+def streamed(age: int) -> Callable[[Arm], list[dict[str, Any]]]:
+    """A goal that holds for 100 ms, `age` ticks ago."""
+
+    def slots(arm: Arm) -> list[dict[str, Any]]:
+        arm.tick(Request(goal=goal(arm.memory, [0.5, 0.3, 0.5])._replace(timeout=0.1)))
+        return [{}] * age
+
+    return slots
+
+
 def creeping(speed: float, pause: int, ticks: int) -> Callable[[Arm], list[dict[str, Any]]]:
     """A joint so slow [rad/s] that its encoder repeats itself for `pause` ticks between two steps."""
     return lambda arm: [
@@ -184,6 +195,7 @@ CASES = {
     "log_degraded": Case(flag(Link.LOG_DEGRADED)),
     "collision": Case(pushed(15.0), pushed(3.0), alone=True),
     "collision_hard": Case(pushed(40.0), alone=True),
+    "goal_stale": Case(streamed(101), streamed(100)),
 }
 
 
@@ -260,7 +272,7 @@ def test_nothing_brings_motion_back_but_an_operator(name: str):
     produced(name, arm)
     arm.ticks(3 * GOOD_TICKS)
     if DEMANDED[name][1] == "A":
-        lasts = name in ("feed_stale", "goal_in_obstacle")  # nobody looked again, nobody took it away
+        lasts = name in ("feed_stale", "goal_in_obstacle", "goal_stale")  # nobody looked again, took it away, sent one
         assert (name in arm.present) == lasts
         assert arm.state() == State.RUN
         return
@@ -278,6 +290,9 @@ def test_an_automatic_fault_clears_after_its_good_ticks_and_not_before(name: str
     if name == "goal_in_obstacle":
         arm.tick(Request(obstacles=(ObstacleEdit("ball", None),)))
         arm.ticks(GOOD_TICKS - 2)
+    elif name == "goal_stale":
+        arm.tick(Request(goal=goal(arm.memory, [0.5, 0.3, 0.5])))
+        arm.ticks(GOOD_TICKS - 1)
     else:
         arm.ticks(GOOD_TICKS - 1)
     assert name in arm.present

@@ -71,6 +71,8 @@ BY_EVIDENCE: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
     ("deadline", {"missed": 10}, {"missed": 10, "powered": False}),
     ("goal_in_obstacle", {"flags": detection.GOAL_INSIDE}, {"flags": detection.GOAL_INSIDE, "has_goal": False}),
     ("goal_in_obstacle", {"flags": detection.GOAL_INSIDE}, {"flags": 0}),
+    ("goal_stale", {"flags": detection.GOAL_OLD}, {"flags": detection.GOAL_OLD, "has_goal": False}),
+    ("goal_stale", {"flags": detection.GOAL_OLD}, {"flags": 0}),
     ("contact", {"flags": detection.CONTACT}, {"flags": detection.CONTACT, "active": False}),
     ("contact", {"flags": detection.CONTACT}, {"flags": 0}),
     ("feed_stale", {"feed_age": 0.501}, {"feed_age": 0.5}),
@@ -224,6 +226,7 @@ innovation        21  SS1 R {MOTION} torque
 log_degraded      51  LOG A
 collision         24  SS2 R
 collision_hard    24  SS1 R
+goal_stale        47  SS2 A
 """
 
 

@@ -20,6 +20,7 @@ from rtctl.world.primitives import obstacles_empty
 
 WATCHED = 0.05  # [s] between two looks at an arm that gets on
 LED = 0.5  # [s] after advice that leads, for which it is looked at more often
+SETTLED = 0.2  # [s] after a goal that followed another as fast, before it is looked at: of a stream only the last is
 CHUNK = 1 << 16  # [bytes] read at once
 LENGTH = struct.Struct("<Q")  # in front of each message [bytes]
 NO_CLOUDS = obstacles_empty(0).clouds
@@ -58,6 +59,7 @@ class Adviser:
         ours.setblocking(False)
         self._socket, self._dt, self._dead = ours, robot.dt, False
         self._goal, self._led_until = 0, 0  # number of the goal; tick
+        self._new, self._begun, self._settled = False, -(1 << 30), 0  # a goal; ticks: of the last, when it is looked at
         self._out, self._in = memoryview(b""), bytearray()  # what is not sent yet, and not yet whole
         self.events: list[tuple[str, str]] = []  # name, detail; whoever tells them takes them out
         self._clouds = NO_CLOUDS  # that it was shown: one may be longer than all else
@@ -65,7 +67,7 @@ class Adviser:
     def begin(self) -> None:
         """Take note of a new goal: what is advised of an older one is dropped."""
         self._goal += 1
-        self._led_until = 0
+        self._led_until, self._new = 0, True
 
     def advise(self, memory: Memory) -> Advice | None:
         """Return what was advised since, the newest; show what is when that is due and the last look is taken."""
@@ -73,7 +75,13 @@ class Adviser:
             return None
         tick, often = memory.tick, memory.tick < self._led_until or memory.status != Status.MOVING
         every = max(1, round((PERIOD if often else WATCHED) / self._dt))
-        if memory.goal is not None and tick % every == 0 and not self._out:
+        if self._new:
+            wait = round(SETTLED / self._dt)
+            self._settled, self._begun = tick + wait if tick - self._begun < wait else tick, tick
+            self._new = False
+        goal = memory.goal
+        looked_at = goal is not None and not goal.streams and tick >= self._settled
+        if looked_at and tick % every == 0 and not self._out:
             self._out = memoryview(self._shown(memory))
         if self._out:
             with suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):

@@ -129,6 +129,10 @@ class Guide:
                 self._forget()
             self.way = None
             return None
+        if m.goal.streams:  # the next one comes before anything is found, or the arm stops
+            self._forget()
+            self.fresh, self.taught = False, True
+            return None
         if self.fresh:
             self.fresh, self.taught = False, m.goal.posture is not None  # by somebody who knows better
             self.scene = self._scene(m)

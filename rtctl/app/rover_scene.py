@@ -10,6 +10,7 @@ from rtctl.app.rover_link import RoverLink, open_link
 from rtctl.app.simulator import open_simulator
 from rtctl.app.tally import Leg, kept, number, of_way
 from rtctl.app.vehicle import Said, Turn
+from rtctl.control.goals import RESTS
 from rtctl.errors import ConfigError
 from rtctl.hal.mavlink.wire import InProcess
 from rtctl.plain import Json
@@ -18,6 +19,7 @@ from rtctl.rover.memory import BaseMemory
 from rtctl.rover.robot import Base
 from rtctl.rover.signals import BaseCommand, BaseFeedback
 from rtctl.spec.base import BaseConfig
+from rtctl.spec.goal import streamed
 from rtctl.spec.scenario import Scenario, goal_of
 from rtctl.types import F64, Goal, Request, State, Task, Verb
 
@@ -161,5 +163,8 @@ def open_play(config: BaseConfig, path: Path, base: Base, scenario: Scenario, so
         raise ConfigError(f"{source}: plant", "a table", "nothing: that is for arms")
     if scenario.start_q_rad is not None:
         raise ConfigError(f"{source}: start_q_rad", "angles", "nothing: a base has start_pose")
+    for k, goal in enumerate(scenario.goal):
+        if found := streamed(goal):
+            raise ConfigError(f"{source}: goal[{k}].{found[0]}", f"{found[1]}", RESTS)
     rover = cast(RoverSimulator, open_simulator(path, scenario, source))
     return RoverPlay(base, scenario, rover, open_link(config, path, InProcess(rover.exchange, base.dt)))

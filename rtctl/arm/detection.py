@@ -26,7 +26,8 @@ from rtctl.types import B1, F64, Feedback
     TOUCHED,  # an external torque that nothing told explains
     STRUCK,  # the same, and large
     UNEXPLAINED,  # the same, and small, while an encoder repeats itself
-) = (1 << i for i in range(16))
+    GOAL_OLD,  # no other goal came within the time-out of this one
+) = (1 << i for i in range(17))
 
 
 class Clearances(NamedTuple):

@@ -86,6 +86,7 @@ FAULTS = (
     Fault("log_degraded", 51, Severity.LOG, "A", "the log cannot be written; arming is refused"),
     Fault("collision", 24, Severity.SS2, "R", "something pushes the arm that nobody told of"),
     Fault("collision_hard", 24, Severity.SS1, "R", "something struck the arm"),
+    Fault("goal_stale", 47, Severity.SS2, "A", "no goal of a stream came within the time-out of the last"),
 )
 TABLE = FaultTable.of(FAULTS)
 BIT, names, severity = TABLE.bit, TABLE.names, TABLE.severity
@@ -143,6 +144,7 @@ class _Bits(NamedTuple):
     innovation: int = BIT["innovation"]
     collision: int = BIT["collision"]
     collision_hard: int = BIT["collision_hard"]
+    goal_stale: int = BIT["goal_stale"]
 
 
 _B = _Bits()
@@ -282,6 +284,8 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
         bits |= _B.deadline
     if e.has_goal and flags & detection.GOAL_INSIDE:
         bits |= _B.goal_in_obstacle
+    if e.has_goal and flags & detection.GOAL_OLD:
+        bits |= _B.goal_stale
     if active and flags & detection.CONTACT:
         bits |= _B.contact
     if e.feed_age > p.feed_timeout:

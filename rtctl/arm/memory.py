@@ -19,7 +19,7 @@ from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.arm.robot import JOINTS_MAX
 from rtctl.plain import Json
-from rtctl.types import F64, I64, Goal, Record, RecordRow, Severity, State, Status, Task
+from rtctl.types import F64, GOAL_TIMEOUT, I64, Goal, Record, RecordRow, Severity, State, Status, Task
 from rtctl.world.obstacle_table import World
 
 FAULTS_MAX = 64  # bits of a word
@@ -90,6 +90,15 @@ HOT = np.dtype(
             ("goal_tolerance", _REAL),
             ("goal_tolerance_rot", _REAL),
             ("goal_axis", _REAL, (3,)),
+            ("goal_v", _REAL, (3,)),  # [m/s] as told; see `stream`
+            ("goal_w", _REAL, (3,)),  # [rad/s]
+            ("goal_a", _REAL, (3,)),  # [m/s2] as seen from goal to goal
+            ("goal_alpha", _REAL, (3,)),  # [rad/s2]
+            ("goal_lead", _REAL, (3,)),  # [m/s] at which the tip is led
+            ("goal_turn", _REAL, (3,)),  # [rad/s]
+            ("goal_age", _REAL),  # [s] since it was taken, where it has a time-out
+            ("goal_gap", _REAL),  # [s] how old the one before became
+            ("goal_timeout", _REAL),  # [s], 0 none
             ("has_posture", _INT),  # 0 none, 1 some, MEASURED_POSTURE
             ("goal_posture", _REAL, _JOINT),
             ("lead_until", _INT),  # tick until which the joints head for that posture
@@ -195,6 +204,7 @@ _FLAGS = (
     "floating",
     "driven",
 )
+_STREAM = tuple(f"goal_{name}" for name in ("v", "w", "a", "alpha", "lead", "turn", "age", "gap", "timeout"))
 _ENUMS = {"state": State, "reaction": Severity, "status": Status, "task": Task}
 
 
@@ -279,6 +289,9 @@ class Memory(msgspec.Struct, frozen=True):
             float(h["goal_tolerance_rot"]),
             h["goal_axis"],
             h["goal_posture"][: self.n] if h["has_posture"] else None,
+            h["goal_v"] if h["goal_v"].any() else None,
+            h["goal_w"] if h["goal_w"].any() else None,
+            float(h["goal_timeout"]) or None,
         )
 
     @property
@@ -386,12 +399,14 @@ def write(hot: F64, changes: Json) -> None:
 def _write_goal(h: RecordRow, goal: Goal | None) -> None:
     h["has_goal"] = goal is not None
     if goal is None:
-        for name in ("goal", "goal_wxyz", "goal_axis", "goal_task", "goal_tolerance", "goal_tolerance_rot"):
+        for name in ("goal", "goal_wxyz", "goal_axis", "goal_task", "goal_tolerance", "goal_tolerance_rot", *_STREAM):
             h[name] = 0
         h["has_posture"], h["goal_posture"], h["lead_until"] = 0, 0.0, 0
         return
     h["goal"], h["goal_wxyz"], h["goal_axis"] = goal.position, goal.wxyz, goal.axis
     h["goal_task"], h["goal_tolerance"], h["goal_tolerance_rot"] = int(goal.task), goal.tolerance, goal.tolerance_rot
+    h["goal_v"], h["goal_w"] = (0.0 if each is None else each for each in (goal.velocity, goal.omega))
+    h["goal_timeout"] = goal.timeout or (GOAL_TIMEOUT if h["goal_v"].any() or h["goal_w"].any() else 0.0)
     h["has_posture"] = goal.posture is not None
     h["goal_posture"], h["lead_until"] = 0.0, 0
     if goal.posture is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from rtctl.arm import collision
 from rtctl.arm.detection import (
     BEYOND,
+    GOAL_OLD,
     STIRS,
     STRUCK,
     TOUCHED,
@@ -38,6 +39,7 @@ from rtctl.arm.estimator import (
 )
 from rtctl.arm.faults import AUTOMATIC, FAULTS, Bounds, Counters, Evidence, counted, detect, implausible_positions
 from rtctl.arm.model import Model
+from rtctl.arm.stream import stale
 from rtctl.arm.target import leads, target_of
 from rtctl.control.faults import latch_with
 from rtctl.kernel import kernel
@@ -255,6 +257,7 @@ def detect_faults(
     if m.contact_level != collision.NO:
         flags |= UNEXPLAINED if m.contact_level == collision.UNEXPLAINED else TOUCHED
         flags |= STRUCK if m.contact_level == collision.STRUCK else 0
+    flags |= GOAL_OLD if stale(c, m) else 0
     evidence = Evidence(
         flags,
         found.age,

@@ -28,6 +28,7 @@ from rtctl.arm.progress import progress_of
 from rtctl.arm.record import Outcome, pack
 from rtctl.arm.robot import Arm
 from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torque, plausible_feedback, predict
+from rtctl.arm.stream import go_on, has_velocity
 from rtctl.arm.target import leads, limit_zones, parking_progress, progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
 from rtctl.kernel import kernel
@@ -163,11 +164,13 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surrou
         if asked.bits & WORLD == 0 and any_set(around.moving):
             _move(around, elapsed)
             moved = MOVED
+        go_on(c, m, elapsed)
         if predict(c, m, plausible, model, elapsed):
             return MODEL | moved
     correct(c, m, model)
     observe(c, m, plausible, model, elapsed)
-    if m.has_goal != 0 and (moved or asked.bits & WORLD or m.goal_task & _POSITION != _POSITION):
+    free = m.goal_task & _POSITION != _POSITION
+    if m.has_goal != 0 and (moved or asked.bits & WORLD or free or has_velocity(m)):
         around.goal_rho[:] = distances_from(around.obstacles, point_along(m.goal_task, m.goal.copy(), m.x))
     detect_faults(c, m, plausible, model, around, implausible)
     if asked.bits & REQUEST or not _uneventful(c, m, all_equal(f.drive, 1)):

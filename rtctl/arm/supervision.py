@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rtctl.arm import faults, task
+from rtctl.arm import faults, stream, task
 from rtctl.arm.escape import Escape
 from rtctl.arm.faults import BIT
 from rtctl.arm.memory import MEASURED_POSTURE, Memory
@@ -12,6 +12,7 @@ from rtctl.control import goals, supervisor
 from rtctl.control.supervisor import Asked, Event, Rules, Session, supervisor_step
 from rtctl.kernel import reductions
 from rtctl.kernel.rotations import quat_of
+from rtctl.plain import Json
 from rtctl.types import F64, Feedback, Goal, Request, Severity, State, Status, Task, Verb
 from rtctl.world import obstacle_table
 
@@ -178,7 +179,21 @@ def with_goal(robot: Robot, m: Memory, request: Request) -> Memory:
         return m._replace(refusal=refusal)
     if goal.posture is not None:
         ends = ends_of(robot, goal.posture)
-    return free_of_goals(m)._replace(goal=goal, goal_rho=rho, status=Status.MOVING, floating=False, ends=ends)
+    seen = _changing(robot, m, goal)
+    return free_of_goals(m)._replace(goal=goal, **seen, goal_rho=rho, status=Status.MOVING, floating=False, ends=ends)
+
+
+def _changing(robot: Robot, m: Memory, goal: Goal) -> Json:
+    """Return what is seen of how a stream changes its velocities: fields of the memory, none for its first goal."""
+    gap, before = float(m.goal_age), m.goal
+    if before is None or before.task != goal.task or not 0.0 < gap <= m.goal_timeout:
+        return {}
+    seen: Json = {"goal_gap": gap, "goal_lead": m.goal_lead, "goal_turn": m.goal_turn}
+    if before.velocity is not None and goal.velocity is not None:
+        seen["goal_a"] = stream.changing(before.velocity, goal.velocity, m.goal_a, gap, robot.motion.a_max)
+    if before.omega is not None and goal.omega is not None:
+        seen["goal_alpha"] = stream.changing(before.omega, goal.omega, m.goal_alpha, gap, robot.motion.alpha_max)
+    return seen
 
 
 def with_advice(robot: Robot, m: Memory, request: Request) -> Memory:

@@ -13,7 +13,9 @@ from rtctl.arm.faults import BRAKES
 from rtctl.arm.field import APART
 from rtctl.arm.law import motion_params
 from rtctl.arm.model import Model
+from rtctl.arm.osc import MotionParams
 from rtctl.arm.progress import GAIN, STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
+from rtctl.arm.stream import aim, has_velocity, stale
 from rtctl.arm.task import point_along, selected, task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import greater, norm
@@ -161,6 +163,16 @@ def _escape(c: RecordRow, m: RecordRow, model: Model, chosen: bool, e: F64) -> F
 
 
 @kernel
+def _ahead(m: RecordRow, p: MotionParams, e: F64, e_rot: F64) -> tuple[F64, F64]:
+    """Return the ways e (3,) [m] and e_rot (3,) [rad] ahead of a goal that moves, so that the tip goes with it."""
+    R, axis, k = m.R.copy(), m.goal_axis.copy(), p.k_p / p.k_v
+    v, w = selected(m.goal_task, axis, R, m.goal_lead.copy(), m.goal_turn.copy())
+    if m.goal_task != m.task:
+        v, w = selected(m.task, m.axis.copy(), R, v, w)
+    return aim(e, v, k, p.v_max, p.a_max), aim(e_rot, w, k, p.w_max, p.alpha_max)
+
+
+@kernel
 def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64, F64, F64]:
     """Choose the target; return the errors e (3,) [m] and e_rot (3,) [rad] of the tip, and the posture (n,) [rad].
 
@@ -191,6 +203,8 @@ def wanted(c: RecordRow, m: RecordRow, model: Model, chosen: bool) -> tuple[F64,
         return np.zeros(3), np.zeros(3), m.goal_posture[:n].copy()
     if m.escape_phase != _NONE:
         e = _escape(c, m, model, chosen, e)
+    elif has_velocity(m):
+        e, e_rot = _ahead(m, motion_params(c), e, e_rot)
     return e, e_rot, m.goal_posture[:n].copy() if m.has_posture != 0 else c.q_rest[:n].copy()
 
 
@@ -199,6 +213,9 @@ def _forget_goal(m: RecordRow) -> None:
     m.has_goal, m.goal_task, m.goal_tolerance, m.goal_tolerance_rot, m.has_posture = 0, 0, 0.0, 0.0, 0
     m.parking = 0
     m.goal[:], m.goal_wxyz[:], m.goal_axis[:], m.goal_posture[:], m.lead_until = 0.0, 0.0, 0.0, 0.0, 0
+    m.goal_v[:], m.goal_w[:], m.goal_a[:], m.goal_alpha[:] = 0.0, 0.0, 0.0, 0.0
+    m.goal_lead[:], m.goal_turn[:] = 0.0, 0.0
+    m.goal_age, m.goal_gap, m.goal_timeout = 0.0, 0.0, 0.0
     m.status, m.still, m.nearest, m.stall_timer = _NO_GOAL, 0, np.inf, 0.0
     m.blocker, m.blockers = -1, np.uint64(0)
     _no_escape(m)
@@ -253,7 +270,12 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
         _forget_goal(m)
         m.status = status
         return WORDS
+    if stale(c, m) or has_velocity(m):  # it is held, or follows: where the goal is now is nowhere to come to
+        m.still, m.nearest, m.stall_timer = 0, np.inf, 0.0
+        _no_escape(m)
+        return _take_status(m, _NO_GOAL if stale(c, m) else _MOVING)
     if arrived(p, target.tolerance, target.tolerance_rot):
+        m.goal_timeout = 0.0  # its stream has come to its end
         changed = _take_status(m, _ARRIVED)
         _no_escape(m)
         m.still = m.still + 1

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rtctl.cli.values import goal_messages
+from rtctl.cli.values import goal_messages, goes_on
 from rtctl.cli.waiting import LEAVES, Notes
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError
 from rtctl.hal.client import Session, accepted
@@ -16,6 +16,7 @@ from rtctl.plain import Json
 POLL = 0.05  # [s] between two looks at the status
 ARRIVED = "arrived"
 PASSED = "passed"
+STALE = "goal_stale"
 MOVING_STATES = ("ARMED", "RUN")
 FIRST = {"IDLE": "; rtctl arm comes first", "STOPPING": "; it comes to rest now", **LEAVES}
 WORDS = {  # what a status means, for one who waits no more
@@ -112,15 +113,18 @@ def awaited(session: Session, message: Json, timeout: float, near: float = 0.0) 
 
 def run_stream(session: Session, lines: Iterable[str], source: str, arguments: argparse.Namespace) -> int:
     """Send the goals in `lines` one after another and return the exit code. Raises UsageError, RequestError."""
-    failed = 0
+    failed, due = 0, time.monotonic()
     last: Json | None = None
     for at, message in goal_messages(lines, source):
         try:
-            if arguments.rate:
-                send(session, message)
-                time.sleep(1.0 / arguments.rate)
-                continue
             send(session, message)
+            if arguments.rate:  # to the grid: goals that move are where they say at their time
+                due = max(due + 1.0 / arguments.rate, time.monotonic() - 0.1)
+                time.sleep(max(0.0, due - time.monotonic()))
+                continue
+            if goes_on(message):
+                last = None
+                continue
             outcome = awaited(session, message, arguments.timeout, arguments.near or 0.0)
             last = message
         except RequestError as error:
@@ -144,6 +148,8 @@ def _end(status: Json, wanted: list[float] | None) -> str:
     if state not in MOVING_STATES:
         faults = ", ".join(map(str, status.get("faults") or ()))
         return f"{state}{': ' + faults if faults else ''}"
+    if STALE in (status.get("faults") or ()):
+        return f"{STALE}: no other goal came within its time-out"
     if status.get("queue_refusal"):
         return str(status["queue_refusal"])
     present = status.get("goal_m")

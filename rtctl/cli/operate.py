@@ -74,6 +74,17 @@ def add(commands: Commands) -> None:
     goal.add_argument("--tool-axis", metavar="AXIS", help="that axis of the tip: x y z -x -y -z (z)")
     goal.add_argument("--axes", metavar="AXES", help="of X Y Z those that count: xy, z, …; none: orientation alone")
     goal.add_argument("--tolerance", metavar="M", type=positive, help="arrived within this distance [m]")
+    goal.add_argument(
+        "--velocity",
+        metavar=("X", "Y", "Z"),
+        nargs=3,
+        type=number,
+        help="of a goal that moves [m/s]: it is not waited for",
+    )
+    goal.add_argument(
+        "--turning", metavar=("X", "Y", "Z"), nargs=3, type=number, help="of its orientation, in world axes [rad/s]"
+    )
+    goal.add_argument("--timeout-ms", metavar="MS", type=positive, help="stop the arm unless another comes within it")
     _add_waiting(goal)
     _add_no_wait(goal)
     goal.add_argument("--wait", action="store_true", help=argparse.SUPPRESS)  # what it does anyway, for older calls
@@ -81,8 +92,10 @@ def add(commands: Commands) -> None:
     goals.description = (
         "Send goals one after another, each when the one before has arrived. A line is x,y,z; x,y,z,roll,pitch,yaw;\n"
         "x,y,z,w,x,y,z; under a header of such names (and dx,dy,dz, lat,lon, heading_rad, tool_axis, axes,\n"
-        "tolerance_m); or JSON:\n"
+        "tolerance_m, vx,vy,vz, wx,wy,wz, timeout_ms); or JSON:\n"
         '{"position_m": [0.4, 0, 0.5], "hold": "orientation"}.\n'
+        "A goal that moves (vx,vy,vz [m/s], wx,wy,wz [rad/s]) is not waited for: the next line follows as it comes,\n"
+        "or at --rate; the last one of a stream rests, or the arm stops.\n"
         "Of a base also a mission of QGroundControl, .plan or .waypoints, of way-points alone."
     )
     goals.add_argument("file", metavar="FILE", help="CSV or JSON lines; - reads standard input as it comes")
@@ -238,7 +251,7 @@ def _clear(arguments: argparse.Namespace) -> int:
 
 def _goal(arguments: argparse.Namespace) -> int:
     from rtctl.cli.goals import Outcome, send_and_wait
-    from rtctl.cli.values import letters
+    from rtctl.cli.values import goes_on, letters
     from rtctl.cli.waiting import ready_session
 
     message: Json = {"verb": "goal", **_place(arguments)}
@@ -253,12 +266,15 @@ def _goal(arguments: argparse.Namespace) -> int:
         "heading_rad": arguments.heading,
         "tool_axis": arguments.tool_axis,
         "tolerance_m": arguments.tolerance,
+        "velocity_m_s": arguments.velocity,
+        "velocity_rad_s": arguments.turning,
+        "timeout_ms": arguments.timeout_ms,
     }
     message |= {key: value for key, value in asked.items() if value is not None}
     if arguments.hold_orientation:
         message["hold"] = "orientation"
     _checked(message)
-    if arguments.no_wait:
+    if arguments.no_wait or goes_on(message):
         return _said(_demand(arguments, message), "goal: accepted")
     with ready_session(arguments, "goal") as session:
         outcome: Outcome = send_and_wait(session, message, arguments.timeout)
@@ -291,7 +307,7 @@ def _place(arguments: argparse.Namespace) -> Json:
 def _goals(arguments: argparse.Namespace) -> int:
     from rtctl.cli import missions
     from rtctl.cli.goals import run_stream
-    from rtctl.cli.values import goal_messages
+    from rtctl.cli.values import goal_messages, goes_on
     from rtctl.cli.waiting import ready_session
 
     if arguments.file != "-" and not os.path.isfile(arguments.file):
@@ -304,6 +320,8 @@ def _goals(arguments: argparse.Namespace) -> int:
         lines = missions.goals_of(text, arguments.file) if missions.is_mission(text) else text.splitlines()
     for at, message in goal_messages(lines, arguments.file):
         _checked(message, f"{arguments.file}:{at}: ")
+        if goes_on(message) and not arguments.rate:
+            raise UsageError(f"{arguments.file}:{at}: got a goal that moves, wanted --rate HZ with it, or - as FILE")
     with ready_session(arguments, "goals") as session:
         return run_stream(session, lines, arguments.file, arguments)
 

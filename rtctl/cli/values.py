@@ -16,11 +16,13 @@ GROUPS = {
     "wxyz": ("qw", "qx", "qy", "qz"),
     "direction": ("dx", "dy", "dz"),
     "latlon_deg": ("lat", "lon"),
+    "velocity_m_s": ("vx", "vy", "vz"),
+    "velocity_rad_s": ("wx", "wy", "wz"),
 }
-SINGLE = ("heading_rad", "tolerance_m", "tolerance_rad")
+SINGLE = ("heading_rad", "tolerance_m", "tolerance_rad", "timeout_ms")
 WORDS = ("axes", "tool_axis")
 KNOWN = tuple(name for group in GROUPS.values() for name in group) + SINGLE + WORDS
-NEEDED = (*GROUPS, "hold")  # one of them: where to go
+NEEDED = ("position_m", "rpy_rad", "wxyz", "direction", "latlon_deg", "hold")  # one of them: where to go
 WANTED = "wanted x,y,z; with roll,pitch,yaw or qw,qx,qy,qz or dx,dy,dz; lat,lon; or a JSON object"
 
 
@@ -105,6 +107,11 @@ def _from_cells(cells: list[str], names: tuple[str, ...], place: str) -> Json:
     if "tool_axis" in given_cells:
         message["tool_axis"] = given_cells["tool_axis"]
     return message | {key: row[key] for key in SINGLE if key in row}
+
+
+def goes_on(message: Json) -> bool:
+    """Return whether a goal moves: there is nothing to arrive at."""
+    return any(any(message.get(key) or ()) for key in ("velocity_m_s", "velocity_rad_s"))
 
 
 def letters(text: str) -> list[str]:

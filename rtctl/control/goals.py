@@ -6,6 +6,8 @@ import numpy as np
 
 from rtctl.types import F64, Goal
 
+RESTS = "a goal that rests: a base follows no stream"
+
 
 def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str, ...]) -> str:
     """Return why a goal cannot be taken, '' when it can.
@@ -16,6 +18,10 @@ def refusal(goal: Goal, base: F64, reach: float, goal_rho: F64, names: tuple[str
         return "goal: got a number that is not finite, wanted finite ones"
     if abs(math.hypot(*goal.wxyz) - 1.0) > 1e-3:
         return f"goal: got wxyz {goal.wxyz}, wanted a unit quaternion"
+    if any(each is not None and not np.isfinite(each).all() for each in (goal.velocity, goal.omega)):
+        return "goal: got a velocity that is not finite, wanted finite numbers"
+    if goal.timeout is not None and not 0.0 < goal.timeout < math.inf:
+        return f"goal: got a time-out of {goal.timeout} s, wanted a positive one"
     d = math.dist(goal.position, base)
     if d > reach:
         return f"goal: got {d:.3f} m from the base, wanted at most the arm's reach of {reach:.3f} m"

@@ -15,9 +15,21 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rtctl.arm.task import point_of, within
+from rtctl.control.goals import RESTS
 from rtctl.errors import ConfigError, RequestError
 from rtctl.plain import Json
-from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
+from rtctl.spec.goal import (
+    Axes,
+    Direction,
+    GoalTurning,
+    GoalVelocity,
+    Heading,
+    TimeOut,
+    ToolAxis,
+    goal_contradiction,
+    goal_from,
+    streamed,
+)
 from rtctl.spec.obstacles import (
     Cloud,
     Length,
@@ -133,6 +145,9 @@ class GoalMessage(_Message, tag="goal", frozen=True, kw_only=True):
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=10.0)] | None = None  # of an arm at most 0.1
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=0.5)] | None = None
     posture_rad: Angles | None = None
+    velocity_m_s: GoalVelocity | None = None
+    velocity_rad_s: GoalTurning | None = None
+    timeout_ms: TimeOut | None = None
 
 
 class World(_Message, tag="world", frozen=True):
@@ -384,6 +399,8 @@ def _goal_of(message: GoalMessage, bounds: Bounds, orientation: Callable[[], Seq
         raise RequestError(f"goal.tolerance_m: got {message.tolerance_m}, wanted at most {ARM_TOLERANCE}")
     if bounds.local is None and message.heading_rad is not None:
         raise RequestError(f"goal.heading_rad: got {message.heading_rad}, wanted rpy_rad or wxyz: {HEADING}")
+    if bounds.local is not None and (found := streamed(message)):
+        raise RequestError(f"goal.{found[0]}: got {found[1]}, wanted {RESTS}")
     _refuse_goal(message)
     goal = goal_from(message, lambda: np.array(orientation()), bounds.tolerance, bounds.tolerance_rot)
     if message.posture_rad is not None:

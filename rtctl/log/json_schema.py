@@ -37,6 +37,9 @@ _GOAL = _object(
     tolerance_rot=_is("number", "[rad]"),
     axis=_list(_NUMBER, "(3,) in the tip's frame"),
     posture=_list(_NUMBER, "(n,) [rad]"),
+    velocity=_list(_NUMBER, "(3,) [m/s] of a goal that moves"),
+    omega=_list(_NUMBER, "(3,) [rad/s]"),
+    timeout=_is("number", "[s] for which it holds unless another comes"),
 )
 _SHAPE = _object(
     name=_STRING,

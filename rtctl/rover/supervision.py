@@ -145,6 +145,8 @@ def with_goal(base: Base, m: BaseMemory, request: Request) -> BaseMemory:
     refusal = "" if m.state == State.RUN else f"goal: not possible in state {m.state.name}"
     if not refusal and goal.task & Task.POSITION not in (Task.POSITION, Task.X | Task.Y):
         refusal = "goal: a base goes to a place, wanted x and y"
+    if not refusal and goal.streams:
+        refusal = "goal: got a velocity or a time-out, wanted " + goals.RESTS
     refusal = refusal or turn.refusal(base, goal)
     if not refusal:
         rho = goal_distance(base, m.world, goal)

@@ -10,13 +10,31 @@ from msgspec import Meta
 from rtctl.arm.task import between
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.spec.obstacles import Orientation, Place, RollPitchYaw, Unit, orientation_contradiction, quaternion
-from rtctl.types import F64, Goal, Task
+from rtctl.types import F64, GOAL_TIMEOUT, Goal, Task
 
 LinearAxis = Literal["x", "y", "z"]
 Axes = Annotated[tuple[LinearAxis, ...], Meta(min_length=1, max_length=3, description="position along these alone")]
 Heading = Annotated[float, Meta(ge=-6.3, le=6.3, description="of a base, counter-clockwise from east")]
 Direction = Annotated[tuple[Unit, Unit, Unit], Meta(description="of the tool's axis in the world; roll is free")]
 ToolAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"], Meta(description="of the tip's frame, for a direction")]
+Beside = Annotated[float, Meta(ge=-10.0, le=10.0)]
+Turning = Annotated[float, Meta(ge=-50.0, le=50.0)]
+GoalVelocity = Annotated[
+    tuple[Beside, Beside, Beside], Meta(description="of a goal that moves: it goes on so until the next one comes")
+]
+GoalTurning = Annotated[
+    tuple[Turning, Turning, Turning], Meta(description="of a goal whose orientation turns, in world axes")
+]
+TimeOut = Annotated[
+    float,
+    Meta(
+        ge=10.0,
+        le=10_000.0,
+        description=f"of a stream: when it has passed without another goal the arm stops; {1e3 * GOAL_TIMEOUT:g} of a "
+        "goal that moves, none of others",
+    ),
+]
+STREAMED = ("velocity_m_s", "velocity_rad_s", "timeout_ms")  # keys of an arm's goals
 _BITS = {"x": Task.X, "y": Task.Y, "z": Task.Z, "rx": Task.RX, "ry": Task.RY, "rz": Task.RZ}
 
 
@@ -39,6 +57,12 @@ class Asked(Protocol):
     def tool_axis(self) -> str | None: ...
     @property
     def heading_rad(self) -> float | None: ...
+    @property
+    def velocity_m_s(self) -> tuple[float, float, float] | None: ...
+    @property
+    def velocity_rad_s(self) -> tuple[float, float, float] | None: ...
+    @property
+    def timeout_ms(self) -> float | None: ...
     @property
     def tolerance_m(self) -> float | None: ...
     @property
@@ -74,9 +98,24 @@ def goal_contradiction(goal: Asked) -> tuple[str, object, str] | None:
             return "axes", ", ".join(goal.axes), "a position_m beside it"
         if not (oriented or goal.hold or goal.direction):
             return "position_m", "nothing", "a position, an orientation or a direction"
+        if goal.velocity_m_s is not None:
+            return "velocity_m_s", list(goal.velocity_m_s), "a position_m beside it"
+    if goal.velocity_rad_s is not None and not (oriented or goal.direction):
+        return "velocity_rad_s", list(goal.velocity_rad_s), "wxyz, rpy_rad or direction beside it"
     if goal.axes is not None and len(set(goal.axes)) != len(goal.axes):
         return "axes", ", ".join(goal.axes), "each axis once"
     return None
+
+
+def streamed(goal: Asked) -> tuple[str, object] | None:
+    """Return the first key of a goal that is a stream's, and what it says, None where there is none."""
+    given = {key: getattr(goal, key) for key in STREAMED}
+    return next(((key, value) for key, value in given.items() if value is not None), None)
+
+
+def _velocity(told: tuple[float, float, float] | None) -> F64 | None:
+    """Return a velocity (3,), None for a goal that rests."""
+    return None if told is None or not any(told) else np.array(told, dtype=np.float64)
 
 
 def goal_from(goal: Asked, wxyz: Callable[[], F64], tolerance: float, tolerance_rot: float) -> Goal:
@@ -101,6 +140,8 @@ def goal_from(goal: Asked, wxyz: Callable[[], F64], tolerance: float, tolerance_
     else:
         bits |= int(Task.ORIENTATION) if goal.hold else 0
         turn = np.array(wxyz(), dtype=np.float64) if goal.hold else np.array([1.0, 0.0, 0.0, 0.0])
+    velocity, omega = _velocity(goal.velocity_m_s), _velocity(goal.velocity_rad_s)
+    timeout = GOAL_TIMEOUT if velocity is not None or omega is not None else None
     return Goal(
         position=np.zeros(3) if goal.position_m is None else np.array(goal.position_m, dtype=np.float64),
         wxyz=turn,
@@ -108,4 +149,7 @@ def goal_from(goal: Asked, wxyz: Callable[[], F64], tolerance: float, tolerance_
         tolerance=tolerance if goal.tolerance_m is None else goal.tolerance_m,
         tolerance_rot=tolerance_rot if goal.tolerance_rad is None else goal.tolerance_rad,
         axis=axis,
+        velocity=velocity,
+        omega=omega,
+        timeout=timeout if goal.timeout_ms is None else 1e-3 * goal.timeout_ms,
     )

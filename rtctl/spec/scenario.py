@@ -9,7 +9,17 @@ from msgspec import Meta
 
 from rtctl.errors import ConfigError
 from rtctl.plain import Json
-from rtctl.spec.goal import Axes, Direction, Heading, ToolAxis, goal_contradiction, goal_from
+from rtctl.spec.goal import (
+    Axes,
+    Direction,
+    GoalTurning,
+    GoalVelocity,
+    Heading,
+    TimeOut,
+    ToolAxis,
+    goal_contradiction,
+    goal_from,
+)
 from rtctl.spec.obstacles import (
     Coordinate,
     Name,
@@ -42,6 +52,9 @@ class GoalTable(Table, frozen=True, kw_only=True):
     heading_rad: Heading | None = None  # of a base
     tolerance_m: Annotated[float, Meta(ge=1e-4, le=1.0)] | None = None
     tolerance_rad: Annotated[float, Meta(ge=1e-3, le=3.2)] | None = None
+    velocity_m_s: GoalVelocity | None = None
+    velocity_rad_s: GoalTurning | None = None
+    timeout_ms: TimeOut | None = None
 
 
 class TimedGoal(GoalTable, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from rtctl.plain import Json
-from rtctl.types import Advice, Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
+from rtctl.types import F64, Advice, Goal, Grip, ObstacleEdit, Payload, Request, Shape, Task, Verb
 
 
 def encode_request(tick: int, request: Request) -> bytes:
@@ -107,5 +107,12 @@ def _goal(body: Json) -> Goal:
         float(body["tolerance"]),
         float(body["tolerance_rot"]),
         np.array(body["axis"], np.float64),
-        None if body.get("posture") is None else np.array(body["posture"], np.float64),
+        _array(body, "posture"),
+        _array(body, "velocity"),  # logs of before there were streams have none
+        _array(body, "omega"),
+        None if body.get("timeout") is None else float(body["timeout"]),
     )
+
+
+def _array(body: Json, key: str) -> F64 | None:
+    return None if body.get(key) is None else np.array(body[key], np.float64)
