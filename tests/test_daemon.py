@@ -107,6 +107,32 @@ class TestSession:
         assert "RUN" in shown.stdout
         assert "arrived" in shown.stdout
 
+    def test_a_stream_of_goals_is_followed_to_its_end_and_one_that_breaks_off_is_stale(self, idle: Rig) -> None:
+        idle.arm()
+        begun = idle.status()["x_m"]
+        lines = [
+            f"{begun[0]:.4f},{begun[1] + 0.005 * k:.4f},{begun[2]:.4f},0,0.1,0,10000" for k in range(20)
+        ]  # as they come: nobody waits at one that moves
+        end = f"{begun[0]:.4f},{begun[1] + 0.1:.4f},{begun[2]:.4f},0,0,0,10000"
+        sent = subprocess.run(
+            [sys.executable, "-m", "rtctl", "goals", "-", "--socket", idle.console],
+            input="\n".join(["x,y,z,vx,vy,vz,timeout_ms", *lines, end]) + "\n",
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert sent.stdout.count("arrived") == 1
+        np.testing.assert_allclose(idle.status()["x_m"], np.add(begun, [0.0, 0.1, 0.0]), atol=5e-3)
+        assert idle.ask("goal", position_m=begun, velocity_m_s=[0.0, -0.1, 0.0], timeout_ms=50)["ok"]
+        until(lambda: idle.status()["faults"] == ["goal_stale"], lambda: f"not stale: {idle.status()}")
+        stale = idle.status()
+        assert (stale["state"], stale["status"]) == ("RUN", "no_goal")
+        assert stale["goal_timeout_ms"] == 50.0
+        assert stale["goal_age_ms"] > 50.0
+        assert stale["goal_velocity_m_s"] == [0.0, -0.1, 0.0]
+        assert idle.ask("hold")["ok"]
+        until(lambda: idle.status()["faults"] == [], lambda: f"still stale: {idle.status()}")
+
     def test_a_ball_on_the_tip_is_refused_and_the_arm_stays_where_it_is(self, idle: Rig) -> None:
         idle.arm()
         before = idle.status()
