@@ -359,6 +359,13 @@ def _reader(name: str) -> Callable[[F64, int], Any]:
 _READERS = {name: _reader(name) for name in HOT.names or ()}
 
 
+def places_of(*names: str) -> I64:
+    """Return where the numbers of some fields are in a memory's flat array, one behind the other."""
+    assert HOT.fields is not None
+    fields = [(HOT[name], HOT.fields[name][1]) for name in names]
+    return np.concatenate([np.arange(at // 8, (at + field.itemsize) // 8) for field, at in fields])
+
+
 def fresh() -> F64:
     """Return the flat array of a record of zeros."""
     return np.zeros(HOT.itemsize // 8)
