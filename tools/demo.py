@@ -23,6 +23,7 @@ from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
+from msgspec.structs import replace
 from rich.console import Console
 from rich.text import Text
 
@@ -88,6 +89,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", default="out/demo", metavar="DIR", help="for log, plot and outputs (%(default)s)")
     parser.add_argument("--interface", default="socketpair", help="of the bus: socketpair, socketcan (%(default)s)")
     parser.add_argument("--channel", help="of the bus (default: a socket of the run's own)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="play no more of the scenario than its first S [s]")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--lockstep", action="store_true", help="time goes on when the drives have been answered")
     pace.add_argument("--realtime", action="store_true", help="real time, however late this machine is")
@@ -96,6 +98,9 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def _demo(args: argparse.Namespace, voice: Voice) -> int:
     scenario = load_scenario(args.scenario)
+    if args.seconds is not None and args.seconds < scenario.duration_s:
+        goals = tuple(goal for goal in scenario.goal if goal.at_s < args.seconds)
+        scenario = replace(scenario, duration_s=args.seconds, goal=goals)
     source = Path(args.config) if args.config else robot_file(scenario, args.scenario)
     loaded = cfg.load(source)  # refuses what is wrong with it under its own name
     out = Path(args.out)

@@ -5,14 +5,12 @@ report; here stand items that turn those lines back into passed, failed and skip
 on the host, which take about as long.
 """
 
-import functools
 import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
-import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -38,42 +36,44 @@ class RemoteFailure(Exception):
 
 
 class Results:
-    """Reports by node id, from a pytest beside vcan0 that runs in the background until somebody asks."""
+    """Reports by node id, from a pytest beside vcan0 that runs in the background.
 
-    def __init__(self, ids: list[str]) -> None:
-        self.folder = tempfile.TemporaryDirectory(prefix="rtctl-reports-", dir="/tmp")
-        self.output, self.lines = (Path(self.folder.name) / name for name in ("output", "lines"))
+    One process starts it; any other that is told the same folder reads the reports as they come. It ends with the
+    process that all of them belong to, however that ends.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.output, self.lines, self.ended = (folder / name for name in ("output", "lines", "ended"))
+
+    def start(self, ids: list[str], owner: int) -> None:
+        """Run these tests while the process `owner` lives."""
+        self.lines.parent.mkdir()
         self.lines.touch()
         tests = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *ids]
         beside = [sys.executable, "-m", "tools.vcan", "--timeout", str(TIMEOUT), "--", *tests]
         # A guest sees the compiled kernels that are in the cache when it starts.
-        command = f"{shlex.join([sys.executable, '-c', WARM])} && exec {shlex.join(beside)}"
+        job = f"{shlex.join([sys.executable, '-c', WARM])} && exec {shlex.join(beside)}"
+        watch = f"while kill -0 $! && kill -0 {owner}; do sleep 0.5; done 2>/dev/null; kill $! 2>/dev/null"
+        command = f"({job}) & {watch}; wait $!; echo $? > {shlex.quote(str(self.ended))}"
         env = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")} | {REPORTS: str(self.lines)}
-        with self.output.open("wb") as out:
-            self.process = subprocess.Popen(
-                ["sh", "-c", command], cwd=ROOT, env=env, stdout=out, stderr=out, start_new_session=True
+        with self.output.open("wb") as out:  # in the background: nobody waits for it by its process
+            subprocess.run(
+                ["sh", "-c", f"({command}) &"], cwd=ROOT, env=env, stdout=out, stderr=out, start_new_session=True
             )
 
-    @functools.cached_property
-    def reports(self) -> dict[str, list[dict[str, Any]]]:
-        """Every report by node id, once all are there."""
-        self.process.wait()
-        found: dict[str, list[dict[str, Any]]] = {}
-        for line in self.lines.read_text().splitlines():
-            report = json.loads(line)
-            found.setdefault(report["id"], []).append(report)
-        return found
+    def of(self, remote_id: str) -> list[dict[str, Any]]:
+        """Return the reports of a test, once it or all are done."""
+        while True:
+            over = self.ended.exists()
+            whole = self.lines.read_text().rpartition("\n")[0] if self.lines.exists() else ""
+            found = [report for report in map(json.loads, whole.splitlines()) if report["id"] == remote_id]
+            if over or any(report["when"] == "teardown" for report in found):
+                return found
+            time.sleep(0.5)
 
     def account(self) -> str:
         """Exit status and the end of the output."""
-        return f"exit status {self.process.wait()}\n{self.output.read_text(errors='replace')[-8000:]}"
-
-    def close(self) -> None:
-        """Stop it if it still runs."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGTERM)
-            self.process.wait()
-        self.folder.cleanup()
+        return f"exit status {self.ended.read_text().strip()}\n{self.output.read_text(errors='replace')[-8000:]}"
 
 
 class RemoteItem(pytest.Item):
@@ -93,9 +93,10 @@ class RemoteItem(pytest.Item):
     def runtest(self) -> None:
         require()
         results = started(self.session)
-        if self.remote_id not in results.reports:
+        reports = results.of(self.remote_id)
+        if not reports:
             raise RemoteFailure(f"no report of {self.remote_id} came back: {results.account()}")
-        for report in results.reports[self.remote_id]:
+        for report in reports:
             for title, content in report["sections"]:
                 self.add_report_section(report["when"], title.removeprefix("Captured "), content)
             if report["outcome"] == "failed":
@@ -110,7 +111,13 @@ class RemoteItem(pytest.Item):
 def started(session: pytest.Session) -> Results:
     """The run beside vcan0, started now if it was not."""
     if RESULTS not in session.stash:
-        session.stash[RESULTS] = Results([i.remote_id for i in session.items if isinstance(i, RemoteItem)])
+        config = session.config
+        base = config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]  # no fixture: no test has begun
+        worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+        results = session.stash[RESULTS] = Results((base.parent if worker else base) / "beside_vcan")
+        if worker in ("", "gw0"):
+            ids = [i.remote_id for i in session.items if isinstance(i, RemoteItem)]
+            results.start(ids, os.getppid() if worker else os.getpid())
     return session.stash[RESULTS]
 
 
@@ -145,16 +152,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """The guest starts first; a worker of xdist, which may never come to its tests, starts it when it does."""
+    """It starts first: a guest takes many minutes."""
     wanted = any(isinstance(item, RemoteItem) for item in session.items) and not session.config.option.collectonly
-    if wanted and vcan.available() and "PYTEST_XDIST_WORKER" not in os.environ:
+    if wanted and vcan.available():
         started(session)
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Nothing outlives the session."""
-    if RESULTS in session.stash:
-        session.stash[RESULTS].close()
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
