@@ -99,6 +99,20 @@ def test_joints_whose_drive_hears_and_whose_encoder_is_true_are_held_then_lowere
     assert found.tip[-1, 2] < found.tip[0, 2] - 0.03  # it is on its way down
 
 
+@pytest.mark.parametrize(("newton", "direction"), [(60.0, (1.0, 0.0, 0.0)), (150.0, (0.0, 0.0, -1.0))])
+def test_an_arm_that_is_struck_at_rest_is_held_although_no_encoder_moved_before(
+    newton: float, direction: tuple[float, ...]
+) -> None:
+    blow = {"kind": "push", "at_s": 0.8, "duration_s": 0.05, "link": "link_5", "newton": newton, "direction": direction}
+    with lab(path=OPENARM, scenario={"fault": [blow]}) as here:
+        here.running()
+        found = course(here, 2.0)
+    assert found.state == State.SAFE_STOP
+    assert told(found) == []
+    assert found.largest(list(range(7)), SOON) < HELD
+    assert found.speed[found.t[1:] > SOON].max() < LOWERED
+
+
 @pytest.mark.parametrize(("inject", "joint"), [("drive_fault@0.6:3", 3), ("stuck_encoder@0.6:1", 1)])
 def test_a_joint_that_cannot_be_held_is_named_and_the_others_keep_the_rest_from_following(
     inject: str, joint: int
