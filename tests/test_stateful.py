@@ -17,7 +17,20 @@ from firmware_sim.inject import KINDS, Fault
 from firmware_sim.simulator import open_simulator
 from rtctl.arm.faults import FAULTS, TABLE, severity
 from rtctl.protocol import frame
-from rtctl.types import Command, Drive, Goal, Link, ObstacleEdit, Request, Severity, Shape, State, Task, Verb
+from rtctl.types import (
+    TOOL_Z,
+    Command,
+    Drive,
+    Goal,
+    Link,
+    ObstacleEdit,
+    Request,
+    Severity,
+    Shape,
+    State,
+    Task,
+    Verb,
+)
 from tests.lab import PANDA, Lab, robot
 
 NS = 1_000_000_000
@@ -151,6 +164,22 @@ class Session(RuleBasedStateMachine):
     def a_goal_is_given(self, at: tuple[float, ...], wxyz: tuple[float, ...], task: Task, verb: Verb) -> None:
         self._step(Request(verb, Goal(np.array(at), np.array(wxyz), task, 0.003, 0.015)))
         self._play(20)
+
+    @rule(
+        at=st.one_of(near, anywhere),
+        v=st.tuples(number, number, number),
+        w=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+        timeout=st.one_of(st.none(), number, st.floats(0.005, 0.1)),
+        ticks=st.integers(1, 60),
+    )
+    def a_goal_that_moves_is_given(
+        self, at: tuple[float, ...], v: tuple[float, ...], w: tuple[float, ...], timeout: float | None, ticks: int
+    ) -> None:
+        turn, task = np.array([0.0, 1.0, 0.0, 0.0]), Task.POSE
+        self._step(
+            Request(goal=Goal(np.array(at), turn, task, 0.003, 0.015, TOOL_Z, None, np.array(v), np.array(w), timeout))
+        )
+        self._play(ticks)
 
     @rule(
         kind=st.sampled_from(["sphere", "box", "capsule", "plane", "point", "n_ellipsoid", "cone", "cylinder", "blob"]),

@@ -143,6 +143,10 @@ def test_while_it_goes_on_it_is_never_there_and_at_its_end_it_arrives():
     assert run.memory.status == Status.ARRIVED
     assert np.linalg.norm(run.tip[-1] - circle(3.0)) < 0.002
     assert troubles(run) == []
+    told = run.figures["goals"]
+    assert [g["arrived"] for g in told] == [True, *[None] * (len(told) - 2), True]
+    assert max(g["error_m"] for g in told[30:-1]) < 0.003  # to where it had come
+    assert run.figures["arrived"]
 
 
 def test_the_tool_turns_with_a_goal_that_turns():
@@ -426,11 +430,12 @@ def test_a_scenario_of_a_base_is_refused_by_the_place(tmp_path: Path):
     [
         ({"velocity": np.array([np.nan, 0.0, 0.0])}, "velocity"),
         ({"omega": np.array([np.inf, 0.0, 0.0])}, "velocity"),
+        ({"velocity": np.array([0.0, 0.0, -101.0])}, "velocity"),
         ({"timeout": -1.0}, "time-out"),
         ({"timeout": math.inf}, "time-out"),
     ],
 )
-def test_the_tick_itself_takes_none_that_is_not_finite(bad: dict[str, Any], words: str):
+def test_the_tick_itself_takes_none_that_nothing_moves_like(bad: dict[str, Any], words: str):
     arm = Standing()
     arm.tick(Request(goal=goal(arm.memory, [0.5, 0.1, 0.5])._replace(**bad)))
     assert words in arm.memory.refusal

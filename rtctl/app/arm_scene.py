@@ -13,13 +13,15 @@ from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
+from rtctl.control.goals import moves
 from rtctl.design.assets import load_assets
 from rtctl.errors import ConfigError
-from rtctl.kernel.rotations import R_of, quat_of
+from rtctl.kernel.rotations import R_of, exp3, quat_of
 from rtctl.plain import Json
 from rtctl.spec.scenario import Scenario, goal_of
 from rtctl.types import (
     F64,
+    GOAL_TIMEOUT,
     Advice,
     Command,
     Drive,
@@ -94,12 +96,23 @@ class ArmTally:
 
 
 def _advanced(leg: Leg, truth: Truth) -> Leg:
-    goal = leg.goal
+    goal = _now(leg.goal, truth.time - leg.at)
     e, e_rot = task.error_of(goal, truth.tip, R_of(truth.tip_wxyz))
     along = task.point_of(goal, leg.start) - leg.start
     offset = task.point_of(goal._replace(position=truth.tip), leg.start) - leg.start  # what is free has no line
     there = e <= goal.tolerance and e_rot <= goal.tolerance_rot
     return leg.advanced(truth.time, there, along, offset, e, e_rot)
+
+
+def _now(goal: Goal, age: float) -> Goal:
+    """Return where a goal is that was given `age` [s] ago."""
+    if not moves(goal):
+        return goal
+    t = min(age, goal.timeout or GOAL_TIMEOUT)
+    x = goal.position if goal.velocity is None else goal.position + goal.velocity * t
+    return goal._replace(
+        position=x, wxyz=goal.wxyz if goal.omega is None else quat_of(exp3(goal.omega * t) @ R_of(goal.wxyz))
+    )
 
 
 class ArmFeed:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.control.goals import moves
 from rtctl.plain import Json
 from rtctl.types import F64, Goal
 
@@ -50,11 +51,11 @@ def of_way(
     legs: Sequence[Leg], path: float, speed: float, clearance: Mapping[str, float], contacts: int, turned: bool
 ) -> Json:
     """Return the figures that every run has under their published names; turned: with errors of orientation."""
-    last = legs[-1] if legs else None
+    last, rests = legs[-1] if legs else None, [leg for leg in legs if not moves(leg.goal)]
     goals = [
         {
             "at_s": number(leg.at),
-            "arrived": leg.reached >= 0.0,
+            "arrived": None if moves(leg.goal) else leg.reached >= 0.0,
             "time_to_goal_s": number(leg.reached - leg.at) if leg.reached >= 0.0 else None,
             "error_m": number(leg.error),
             **({"error_rad": number(leg.error_rot)} if turned else {}),
@@ -63,7 +64,7 @@ def of_way(
         for leg in legs
     ]
     return {
-        "arrived": last is not None and all(leg.reached >= 0.0 for leg in legs),
+        "arrived": bool(rests) and all(leg.reached >= 0.0 for leg in rests),
         "time_to_goal_s": goals[-1]["time_to_goal_s"] if goals else None,
         "final_error_m": number(last.error) if last else None,
         **({"final_error_rad": number(last.error_rot) if last else None} if turned else {}),

@@ -224,7 +224,7 @@ def _sim(arguments: argparse.Namespace) -> int:
 def _missed(result: Json) -> str:
     """Return what a run failed in, in words, '' for nothing."""
     goals = result.get("goals") or ()
-    missed, touched = sum(not goal["arrived"] for goal in goals), int(result.get("contacts") or 0)
+    missed, touched = sum(goal["arrived"] is False for goal in goals), int(result.get("contacts") or 0)
     why = [f"{missed} of {len(goals)} goals missed"] if missed else []
     return ", ".join([*why, f"{touched} contacts"] if touched else why)
 
