@@ -109,9 +109,14 @@ def surface(solid: Solid, edge: float = EDGE) -> tuple[F64, I64]:
         p, q, r = (triangles[rows, (first + k) % 3] for k in range(3))
         middle = 0.5 * (p + q)
         triangles = np.concatenate([np.stack([p, middle, r], axis=1), np.stack([middle, q, r], axis=1)])
-    split = np.concatenate(done)
-    samples, index = np.unique(split.reshape(-1, 3), axis=0, return_inverse=True)
-    return samples, index.reshape(-1, 3).astype(np.int64)
+    split = np.concatenate(done).reshape(-1, 3)
+    # numpy's unique of rows takes four times as long: it compares them as records
+    order = np.lexsort((split[:, 2], split[:, 1], split[:, 0]))
+    ordered = split[order]
+    new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    index = np.empty(len(split), np.int64)
+    index[order] = np.cumsum(new) - 1
+    return ordered[new], index.reshape(-1, 3)
 
 
 def areas(samples: F64, triangles: I64) -> F64:
