@@ -13,6 +13,7 @@ MACHINE = {
 }
 
 
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in a hook of the same name
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep the tests of a file together, so that what they share is made once, and those of MACHINE on one worker."""
     if hasattr(config, "workerinput"):

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from rtctl.errors import EXIT_CONFIG, EXIT_OK, EXIT_USAGE
+from rtctl.kernel.cache import folder
 from tests.base_lab import CONFIGS, ROVER
 
 ROOT = Path(__file__).parent.parent
@@ -89,6 +90,7 @@ def test_a_rover_starts_where_it_may_write_its_state_alone_and_has_no_capability
     config = tmp_path / "rover.toml"
     text = ROVER.read_text().replace('directory = "logs"', f'directory = "{tmp_path / "logs"}"')
     config.write_text(text + f'\n[console]\nsocket = "{tmp_path / "run" / "s"}"\n')
+    shutil.copytree(folder(), tmp_path / f"rtctl-kernels-{os.geteuid()}")  # it looks there: home is read-only
     script = (
         f"{sys.executable} -m firmware_sim {config} & double=$!; "
         f"{sys.executable} -m rtctl run {config} & daemon=$!; "
