@@ -33,7 +33,7 @@ demo-rover: install
 	$(BIN)/python -m tools.demo_rover
 
 test: install lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_FLAGS)
 
 lint: install
 	$(BIN)/ruff check

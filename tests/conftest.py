@@ -1,9 +1,12 @@
 """What every test shares: repeatable property tests."""
 
 import signal
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
 # Files that start daemons, drives or recorders: one after the other, whatever else runs beside them (pytest -n).
 MACHINE = {
@@ -13,13 +16,19 @@ MACHINE = {
 }
 
 
-@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in a hook of the same name
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tests of a file together, so that what they share is made once, and those of MACHINE on one worker."""
-    if hasattr(config, "workerinput"):
-        for item in items:
-            alone = item.path.stem.removeprefix("test_") in MACHINE or item.path.parent.name == "hil"
-            item.add_marker(pytest.mark.xdist_group("machine" if alone else item.path.name))
+class ByFile(LoadScopeScheduling):  # type: ignore[misc]  # the library has no types
+    """Keeps the tests of a file together, so that what they share is made once, and those of MACHINE on one worker."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        path = Path(nodeid.partition("::")[0])
+        alone = path.stem.removeprefix("test_") in MACHINE or path.parent.name == "hil"
+        return "machine" if alone else str(path)
+
+
+@pytest.hookimpl(optionalhook=True)  # where pytest-xdist is off there is no such hook
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
+    """Return the order in which workers get tests; groups by mark do not reach pytest-xdist 3.8 from pytest 9.2."""
+    return ByFile(config, log)
 
 
 # No deadline: compilation and a busy machine are not failures. Derandomised: a red run is red again.

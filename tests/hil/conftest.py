@@ -85,7 +85,6 @@ class RemoteItem(pytest.Item):
         self.place = function.reportinfo()
         self.own_markers.extend(function.own_markers)
         self.keywords.update(function.keywords)
-        self.add_marker(pytest.mark.xdist_group("vcan"))  # one worker, hence one guest
 
     def reportinfo(self) -> tuple[os.PathLike[str] | str, int | None, str]:
         return self.place
