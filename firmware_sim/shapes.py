@@ -39,6 +39,8 @@ class Shape(NamedTuple):
     group: str = ""
     mesh: str = ""
     cloud: bytes = b""
+    influence: float = 0.0
+    clearance: float = 0.0
 
 
 class ObstacleEdit(NamedTuple):
@@ -239,7 +241,8 @@ def shape_at(obstacle: Solid, t: float) -> Shape | None:
     if angle > 0.0:
         axis = omega / np.linalg.norm(omega)
         wxyz = multiply(np.concatenate(([math.cos(0.5 * angle)], math.sin(0.5 * angle) * axis)), wxyz)
-    return Shape(o.name, o.type, o.dims, position, wxyz, velocity, omega, o.group, o.key)
+    room = float(o.spec.get("influence_m") or 0.0), float(o.spec.get("clearance_m") or 0.0)
+    return Shape(o.name, o.type, o.dims, position, wxyz, velocity, omega, o.group, o.key, b"", *room)
 
 
 def reported(obstacle: Solid, shape: Shape) -> Shape:

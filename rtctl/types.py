@@ -169,6 +169,8 @@ class Shape(NamedTuple):
     group: str = ""  # parts of one union: of them the nearest to a point acts on it; "" = adds to the others
     mesh: str = ""  # of a mesh: the name of its solid among the robot's
     cloud: bytes = b""  # of a cloud: x, y, z of each point in whole steps, little-endian int16
+    influence: float = 0.0  # [m] of its own, 0: the config's
+    clearance: float = 0.0  # [m] likewise
 
 
 class ObstacleEdit(NamedTuple):

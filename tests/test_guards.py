@@ -43,12 +43,12 @@ def bounds_of(low: F64, high: F64, rows: F64 | None = None, most: F64 | None = N
     return Bounds(low, high, rows, np.zeros(0) if most is None else most)
 
 
-def nearby_of(points: MovingPoints, seen: Field, qd: F64, zone: float, braking: float, rate: F64) -> Nearby:
-    """Return the points nearer than `zone` [m] to obstacles, with their cheap bounds."""
+def nearby_of(points: MovingPoints, seen: Field, qd: F64, share: float, braking: float, rate: F64) -> Nearby:
+    """Return the points within a share of the influence of obstacles, with their cheap bounds."""
     room, m, n = len(seen.leader) * len(points.radius), len(points.radius), len(qd)
     whole, real = np.zeros(3 * room + 1, np.int64), np.zeros(room + 4 * m + n + 1)
     views = getattr(nearby_in, "py_func", nearby_in)  # a leaf kernel gives arrays to leaf kernels alone
-    whole[-1] = look_near(views(whole, real, points, seen, qd, braking, rate), zone)
+    whole[-1] = look_near(views(whole, real, points, seen, qd, braking, rate), share)
     near: Nearby = views(whole, real, points, seen, qd, braking, rate)
     return near
 
@@ -75,7 +75,7 @@ def guard(
     nothing = MovingPoints(
         np.zeros((0, 3)), np.zeros((0, 3, n)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, np.int64)
     )
-    near = nearby_of(nothing, field_buffers(0, 0, n), np.zeros(n), 0.05, 5.0, np.ones(n))
+    near = nearby_of(nothing, field_buffers(0, 0, n), np.zeros(n), 0.5, 5.0, np.ones(n))
     motors = Motors(np.zeros(n), np.full(n, np.inf))
     out, acts = sent_of(Inertia(A, A_inv), motors, tau, bounds_of(low, high, rows, most), near, start)
     return out - tau, acts
@@ -260,7 +260,7 @@ def test_nothing_is_pulled_into_what_is_near(pull: float):
     x, v, sent, least = 0.049, -0.5, 0.0, np.inf
     for _ in range(1500):
         qd = np.array([v, 0.0, 0.0])
-        near = nearby_of(*beside_wall(x, v), qd, 0.05, 5.0, rate)
+        near = nearby_of(*beside_wall(x, v), qd, 0.5, 5.0, rate)
         tau, low = np.array([-pull, 0.0, 0.0]), np.full(3, -1e6)
         asked = sent_of(Inertia(eye, eye), Motors(ZERO, FREE[:3]), tau, bounds_of(low, -low), near)[0][0]
         v, x = v + 1e-3 * sent, x + 1e-3 * v
@@ -309,7 +309,7 @@ def test_rows_that_are_made_only_when_passed_give_the_answer_of_all_of_them(seed
     tau = force * np.random.default_rng(seed + 1).normal(size=7)
     C, b = explicit(model, points, seen, qd, rate)
     low = np.full(7, -1e3)
-    near = nearby_of(points, seen, qd, 0.5 * robot().avoid.rho0, robot().motion.a_max, rate)
+    near = nearby_of(points, seen, qd, 0.5, robot().motion.a_max, rate)
     assert near.size == len(b)
     got, _ = sent_of(Inertia(model.A, model.A_inv), Motors(np.zeros(7), FREE), tau, bounds_of(low, -low), near)
     wanted = model.A_inv @ tau
@@ -322,7 +322,7 @@ def test_rows_that_are_made_only_when_passed_give_the_answer_of_all_of_them(seed
 def test_cheap_bounds_are_never_above_the_true_ones(seed: int):
     model, points, seen, qd, rate = crowd(seed)
     _, b = explicit(model, points, seen, qd, rate)
-    near = nearby_of(points, seen, qd, 0.5 * robot().avoid.rho0, robot().motion.a_max, rate)
+    near = nearby_of(points, seen, qd, 0.5, robot().motion.a_max, rate)
     assert (np.diff(points.link) >= 0).all()  # so both lists have the same order
     assert (near.found.most[: near.size] <= b).all()
     assert not near.size or (near.found.most[: near.size] < b).any()

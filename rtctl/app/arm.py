@@ -161,11 +161,18 @@ def status(robot: Robot, m: Memory, link: Bus, said: Sequence[Said]) -> Json:
         "error_m": error,
         "error_rad": error_rot,
         "clearance_m": clearances(m),
+        "rooms_m": rooms(m),
         "payload": dict(zip(("mass_kg", "com_m"), (float(m.payload[0]), m.payload[1:]), strict=True)),
         "grippers": [grip_status(g, m.grippers[:, k]) for k, g in enumerate(robot.grippers)],
         "untold_Nm": m.lasting if m.noticed else np.zeros(robot.n),
         "torque_ratio": float((np.abs(m.sent[0]) / robot.tau_rated).max()),
     }
+
+
+def rooms(m: Memory) -> Json:
+    """Return influence and clearance [m] of the obstacles that have their own, by name."""
+    own = m.world.obstacles.room
+    return {m.world.names[k]: own[k, :2].tolist() for k in np.flatnonzero(m.world.obstacles.active & (own[:, 0] > 0.0))}
 
 
 def grip_status(gripper: Gripper, memory: F64) -> Json:

@@ -13,11 +13,13 @@ from rtctl.app.vehicle import Link, Said, Turn
 from rtctl.arm import task
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
+from rtctl.control.firas import rooms_of
 from rtctl.control.goals import moves
 from rtctl.design.assets import load_assets
 from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of, exp3, quat_of
 from rtctl.plain import Json
+from rtctl.spec.obstacles import refuse_rooms
 from rtctl.spec.scenario import Scenario, goal_of
 from rtctl.types import (
     F64,
@@ -242,4 +244,5 @@ def scenario_robot(robot: Robot, scenario: Scenario, path: Path) -> Robot:
         if goal.heading_rad is not None:
             place = f"{path}: goal[{k}].heading_rad"
             raise ConfigError(place, f"{goal.heading_rad:g}", "rpy_rad or wxyz: an arm has no heading")
+    refuse_rooms(scenario.obstacle, rooms_of(robot.avoid), str(path))
     return robot._replace(meshes=load_assets((), scenario.obstacle, path, robot.meshes).meshes)

@@ -287,7 +287,7 @@ def world(servo: Servo[R, M, F, C]) -> Json:
     """
     known = servo.memory.world
     slots = np.flatnonzero(known.obstacles.active)
-    rows = {key: getattr(known.obstacles, key)[slots] for key in ("kind", "R", "p", "v", "w", "dims", "margin")}
+    rows = {key: getattr(known.obstacles, key)[slots] for key in ("kind", "R", "p", "v", "w", "dims", "margin", "room")}
     starts = dict(zip(known.known.starts, known.known.names, strict=True))
     meshes = [starts[int(d[3])] if kind == MESH else "" for kind, d in zip(rows["kind"], rows["dims"], strict=True)]
     return {"names": [known.names[k] for k in slots], "slots": slots, "meshes": meshes, "obstacles": rows}

@@ -155,7 +155,7 @@ class Guide:
         """Return what tells whether what rests is as it was."""
         o = m.obstacles
         rests = ~(o.v.any(axis=1) | o.w.any(axis=1))
-        return b"".join(each[rests].tobytes() for each in (o.kind, o.p, o.R, o.dims))
+        return b"".join(each[rests].tobytes() for each in (o.kind, o.p, o.R, o.dims, o.room))
 
     def _site(self, m: Seen) -> Site:
         return Site(self.robot, self.chain, m.obstacles._replace(mesh=self.robot.meshes.data), m.q)

@@ -27,7 +27,7 @@ HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
-SLOTS = Obstacles._fields[:9]  # what there is of each obstacle; the rest are bodies that they share
+SLOTS = Obstacles._fields[:10]  # what there is of each obstacle; the rest are bodies that they share
 
 
 class Site(NamedTuple):
@@ -43,7 +43,7 @@ class Ending(NamedTuple):
     """A posture that has the goal."""
 
     q: F64  # (n,) [rad]
-    rho: float  # [m] from the points to obstacles
+    rho: float  # [m] from the points to obstacles, as the config's influence and clearance count it
     clear: bool  # the links keep the clearance from them
     cost: float  # [s]
 

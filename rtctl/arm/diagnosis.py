@@ -19,6 +19,7 @@ from rtctl.kernel import kernel
 from rtctl.kernel.linalg import matvec, symmetric_eigen, tmatvec
 from rtctl.kernel.reductions import norm
 from rtctl.types import F64, I64, Status
+from rtctl.world.rooms import OWN_INFLUENCE
 
 MASK = 64  # bits of a record's mask
 HOLDS = 0.1  # share from which something is said to hold the arm
@@ -37,7 +38,7 @@ class Balance(NamedTuple):
     granted: float  # share of the wanted tip acceleration that the drive gives: 1, and 0 for a lost direction
     full: F64  # (n,) |wanted torque| / tau_max
     goal_rho: F64  # (K,) [m] from the goal to each obstacle
-    rho0: float  # [m]
+    rho0: F64  # (K,) [m] influence of each obstacle
     edge: bool  # the tip is as far in the goal's direction as the links are long
 
 
@@ -88,7 +89,7 @@ def blockers(b: Balance) -> Blockers:
     if len(joints) and b.limits.sum() >= b.obstacles.sum() and (not lost or b.limits.sum() > 0.5):
         return Blockers(Status.LIMITED, _mask(joints), int(b.limits.argmax()))
     if len(walls) and not lost:
-        shadowed = bool((b.goal_rho[walls] < b.rho0).all())
+        shadowed = bool((b.goal_rho[walls] < b.rho0[walls]).all())
         status = Status.SHADOWED if shadowed else Status.LOCAL_MINIMUM
         return Blockers(status, _mask(walls), int(b.obstacles.argmax()))
     if lost:
@@ -131,9 +132,15 @@ def balance(robot: Robot, m: Memory, tau_limits: F64, tau_wanted: F64) -> Balanc
         1.0 if led else granted,
         np.abs(tau_wanted) / robot.tau_max,
         m.goal_rho,
-        robot.avoid.rho0,
+        influences(robot, m),
         not led and norm(e) > m.goal.tolerance and at_edge(m.model.J, e),
     )
+
+
+def influences(robot: Robot, m: Memory) -> F64:
+    """Return the influence (K,) [m] of each obstacle: its own, or the config's."""
+    own: F64 = m.world.obstacles.room[:, OWN_INFLUENCE]
+    return np.where(own > 0.0, own, robot.avoid.rho0)
 
 
 def _drive(robot: Robot, m: Memory) -> F64:
@@ -233,7 +240,8 @@ def names(robot: Robot, m: Memory, found: Blockers) -> tuple[str, ...]:
             if pair >= 0 and m.model.own_rho[pair] < robot.self_avoid.rho0:
                 return (" and ".join(robot.own.names[pair]),)
             k = int(m.rho.argmin())  # what no field holds is held by a guard of what is near
-            return (f"{m.world.names[k]} at {_nearest(robot, k)}",) if m.rho[k] < robot.avoid.rho0 else (UNKNOWN,)
+            near = m.rho[k] < influences(robot, m)[k]
+            return (f"{m.world.names[k]} at {_nearest(robot, k)}",) if near else (UNKNOWN,)
         case _:
             return tuple(f"{m.world.names[k]} at {_link(robot, k)}" for k in order)
 

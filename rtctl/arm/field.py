@@ -34,11 +34,13 @@ from rtctl.control.firas import (
     field_params,
     firas,
     limit_params,
+    put_room,
     rho_num_of,
 )
 from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into, speed_bound
+from rtctl.world.rooms import OWN_CLEARANCE, OWN_INFLUENCE, widest
 
 __all__ = [
     "CAPPED",
@@ -85,14 +87,14 @@ class Ends(NamedTuple):
 
     P: F64  # (m, 3) [m]
     rho: F64  # (K, m) [m] from each obstacle there
-    least: float  # [m] below which no influence shrinks
+    least: float  # [m] below which no influence shrinks, of obstacles with the config's clearance
     apart: float  # APART, or APART_LED
     beside: float  # [m] from its place, within which a point's influences are no wider than there
     own: F64  # (L,) [m] between the links of the arm there
 
 
 @leaf_kernel
-def _reach(ends: Ends, k: int, j: int, points: F64, params: FieldParams) -> float:
+def _reach(ends: Ends, k: int, j: int, points: F64, rho0: float, least: float) -> float:
     """Return the influence [m] of the obstacle in slot k on point j: at the goal the clearance that it has there.
 
     The field then vanishes in the goal's posture, which is the minimum of the whole potential (goals non-reachable with
@@ -101,7 +103,7 @@ def _reach(ends: Ends, k: int, j: int, points: F64, params: FieldParams) -> floa
     """
     x, y, z = points[_P, j] - ends.P[j, 0], points[_P + 1, j] - ends.P[j, 1], points[_P + 2, j] - ends.P[j, 2]
     reach = ends.rho[k, j] + ends.apart * max(math.sqrt(x * x + y * y + z * z) - ends.beside, 0.0)
-    bounded: float = min(max(reach, ends.least), params.rho0)
+    bounded: float = min(max(reach, least), rho0)
     return bounded
 
 
@@ -145,7 +147,9 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: 
     rho_dot = n . (point velocity - surface velocity); the surface point is x = P - rho n, and n . (w x n) = 0.
     """
     p, v, w, points, pairs = obstacles.p, obstacles.v, obstacles.w, out.points, out.pairs
-    rho0, rho_min, rho_num, eta, k_d = params.rho0, params.rho_min, params.rho_num, params.eta, params.k_d
+    rho0, rho_min, rho_num = out.rooms[k, 0], out.rooms[k, 1], out.rooms[k, 2]
+    eta, k_d = out.rooms[k, 3], out.rooms[k, 4]
+    thinnest = ends.least if rho_min == params.rho_min else ends.least * rho_min / params.rho_min
     look_ahead, soft, floor = params.look_ahead, params.v_smooth, 1.0 / params.m_max
     heavy, whole = params.m_max * params.m_max, int(params.forms) & TASK != 0
     px, py, pz, vx, vy, vz, wx, wy, wz = p[k, 0], p[k, 1], p[k, 2], v[k, 0], v[k, 1], v[k, 2], w[k, 0], w[k, 1], w[k, 2]
@@ -161,7 +165,7 @@ def _repel(obstacles: Obstacles, k: int, params: FieldParams, out: Field, ends: 
         towards = x * (vx + wy * dz - wz * dy) + y * (vy + wz * dx - wx * dz) + z * (vz + wx * dy - wy * dx)
         rho_dot = x * points[_V, j] + y * points[_V + 1, j] + z * points[_V + 2, j] - towards
         wide = 0.0 if towards <= 0.0 else (0.5 * towards * towards / soft if towards < soft else towards - 0.5 * soft)
-        reach = _reach(ends, k, j, points, params) if near_goal else rho0 + look_ahead * wide
+        reach = _reach(ends, k, j, points, rho0, thinnest) if near_goal else rho0 + look_ahead * wide
         if pairs[k, RHO, j] >= reach:
             continue
         clearance, least = min(rho_min, reach / LEAST_REACH), min(rho_num, reach / LEAST_REACH)
@@ -220,9 +224,9 @@ def _yield_to_nearer(k: int, slots: int, group: I64, out: Field) -> int:
 
 
 @leaf_kernel
-def _gather(k: int, link: I64, rho_num: float, out: Field) -> int:
+def _gather(k: int, link: I64, out: Field) -> int:
     """Add the accelerations of slot k to the shares of its union; return the flags."""
-    flags, leader, pairs = 0, out.leader[k], out.pairs
+    flags, leader, pairs, rho_num = 0, out.leader[k], out.pairs, out.rooms[k, 2]
     if leader == k:
         for l in range(out.share.shape[1]):
             out.share[k, l] = 0.0
@@ -271,7 +275,8 @@ def _add_torques(Jp: F64, points: F64, tau: F64) -> None:
 @leaf_kernel
 def _near(radius: F64, obstacles: Obstacles, params: FieldParams, prefilter: bool, out: Field) -> bool:
     """Measure all distances; mark the slots within the widest influence in `leader` (>= 0); return whether any is."""
-    cutoff = params.rho0 + params.look_ahead * speed_bound(obstacles)
+    room = obstacles.room
+    cutoff = widest(room, obstacles.active, params.rho0) + params.look_ahead * speed_bound(obstacles)
     distances_into(out.points, radius, obstacles, cutoff if prefilter else math.inf, out.pairs)
     any_near = False
     for k in range(obstacles.active.shape[0]):
@@ -281,6 +286,7 @@ def _near(radius: F64, obstacles: Obstacles, params: FieldParams, prefilter: boo
             out.rho_min[k], out.nearest[k] = _least(out.pairs, k)
             if not out.rho_min[k] >= cutoff:
                 out.leader[k], out.near_count[k] = k, _near_points(out.pairs, k, cutoff, out.near)
+                put_room(params, room[k, OWN_INFLUENCE], room[k, OWN_CLEARANCE], out.rooms, k)
                 any_near = True
     return any_near
 
@@ -334,7 +340,7 @@ def field_to(
             _repel(obstacles, k, params, out, ends)
             if unions:
                 out.leader[k] = _yield_to_nearer(k, slots, obstacles.group, out)
-            flags |= _gather(k, points.link, params.rho_num, out)
+            flags |= _gather(k, points.link, out)
     for k in range(slots):
         if out.leader[k] >= 0:
             _add_forces(k, points.link, params, out)

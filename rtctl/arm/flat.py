@@ -2,7 +2,7 @@
 
     parameters  the model of the last evaluation and the task space that goes with it; changes at the model rate
     table       what changes of K obstacle slots in every tick: p, R, margin, age, rho, goal_rho
-    shapes      what an edit alone changes of them: kind, active, moving, group, v, w, dims
+    shapes      what an edit alone changes of them: kind, active, moving, group, v, w, dims, room
 
 Inside, they are the named tuples again, whose arrays are views.
 """
@@ -13,12 +13,13 @@ from rtctl.arm.field import Field
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams, OperationalSpace, _operational_space
 from rtctl.arm.task import selection
+from rtctl.control.firas import ROOM
 from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64
 from rtctl.world.primitives import Obstacles
 
 TABLE = 16  # numbers of a slot in the table: p 3, R 9, margin, age, rho, goal_rho
-SHAPES = 15  # and in the shapes: kind, active, moving, group, v 3, w 3, dims 5; then creep and stale of them all
+SHAPES = 19  # and in the shapes: kind, active, moving, group, v 3, w 3, dims 5, room 4; then creep, stale of them all
 BODIES = tuple[F64, tuple[F64, F64, F64, F64]]  # mesh and clouds of `Obstacles`
 
 
@@ -104,6 +105,7 @@ def shapes_of(obstacles: Obstacles, moving: B1, creep: float, stale: float) -> F
     at = _put(out, 4 * slots, obstacles.v)
     at = _put(out, at, obstacles.w)
     at = _put(out, at, obstacles.dims)
+    at = _put(out, at, obstacles.room)
     out[at], out[at + 1] = creep, stale
     return out
 
@@ -139,6 +141,7 @@ def obstacles_in(t: F64, shapes: F64, bodies: BODIES) -> tuple[Obstacles, B1]:
         dims.reshape(slots, 5),
         group,
         t[12 * slots : 13 * slots],
+        shapes[15 * slots : 19 * slots].reshape(slots, 4),
         bodies[0],
         bodies[1],
     ), moving
@@ -160,6 +163,7 @@ def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
     a = n + 4 * slots
     b = a + 6 * slots * m
     c = b + 15 * m
+    d = c + slots * (n + 1)
     return Field(
         reals[:n],
         reals[n : n + slots],
@@ -167,7 +171,8 @@ def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
         reals[n + slots : a].reshape(slots, 3),
         reals[a:b].reshape(slots, 6, m),
         reals[b:c].reshape(15, m),
-        reals[c : c + slots * (n + 1)].reshape(slots, n + 1),
+        reals[c:d].reshape(slots, n + 1),
+        reals[d : d + ROOM * slots].reshape(slots, ROOM),
         wholes[slots : 2 * slots],
         wholes[3 * slots : (3 + m) * slots].reshape(slots, m),
         wholes[2 * slots : 3 * slots],
@@ -176,4 +181,4 @@ def field_in(reals: F64, wholes: I64, n: int, m: int, slots: int) -> Field:
 
 def field_sizes(slots: int, m: int, n: int) -> tuple[int, int]:
     """Return how many real and whole numbers the work arrays of K = `slots` obstacles, m points, n joints are."""
-    return n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)
+    return n + slots * (5 + n + ROOM + 6 * m) + 15 * m, slots * (3 + m)

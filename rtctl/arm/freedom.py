@@ -12,6 +12,7 @@ from rtctl.arm.self_collision import Hulls, not_apart
 from rtctl.kernel import kernel
 from rtctl.types import F64, I64
 from rtctl.world.primitives import Obstacles, distances_into
+from rtctl.world.rooms import count_rooms, farthest
 
 BALLS = 0.005  # [m] that the points keep all the same: one that touches stops the arm
 RELAX = 0.3  # [m/rad] by which what must be kept free grows from what an anchor has
@@ -42,7 +43,7 @@ class Body(NamedTuple):
 class Room(NamedTuple):
     """What a posture must keep free of; near the anchors no more than these have."""
 
-    rho: float  # [m] to obstacles
+    rho: float  # [m] to obstacles, as the config's influence and clearance count it
     own: float  # [m] between links
     anchors: F64  # (a, n) [rad]
     near: F64  # (a, 2) [m] rho and own there
@@ -74,14 +75,16 @@ def _within(robot: Robot, skin: Points) -> Skin:
 
 @kernel
 def _skin_keeps(body: Body, j: int, R: F64, t: F64, obstacles: Obstacles, rho: float) -> bool:
-    """Return whether the links' surface within point j keeps rho [m] from every obstacle."""
+    """Return whether the links' surface within point j keeps rho [m] from every obstacle, as the config's count."""
     first, count, l = body.skin.start[j], body.skin.start[j + 1] - body.skin.start[j], body.link[j]
     P, out = np.empty((3, count)), np.empty((obstacles.active.shape[0], 4, count))
     for s in range(count):
         x = body.skin.local[first + s]
         for i in range(3):
             P[i, s] = t[l, i] + R[l, i, 0] * x[0] + R[l, i, 1] * x[1] + R[l, i, 2] * x[2]
-    distances_into(P, body.skin.radius[first : first + count], obstacles, rho, out)
+    far = farthest(obstacles.room, obstacles.active, rho)
+    distances_into(P, body.skin.radius[first : first + count], obstacles, far, out)
+    count_rooms(obstacles.room, out)
     for o in range(out.shape[0]):
         for s in range(count):
             if out[o, 0, s] < rho:
@@ -98,6 +101,7 @@ def first_blocked(body: Body, Q: F64, obstacles: Obstacles, room: Room, share: f
     b, n, m = Q.shape[0], Q.shape[1], body.link.shape[0]
     R, t, P = np.empty((n + 1, 3, 3)), np.empty((n + 1, 3)), np.empty((3, m))
     rho = np.empty((obstacles.active.shape[0], 4, m))
+    far = farthest(obstacles.room, obstacles.active, room.rho)
     stride = 1
     while stride < b:
         stride *= 2
@@ -118,7 +122,8 @@ def first_blocked(body: Body, Q: F64, obstacles: Obstacles, room: Room, share: f
                 for i in range(3):
                     P[i, j] = t[l, i] + R[l, i, 0] * body.local[j, 0] + R[l, i, 1] * body.local[j, 1]
                     P[i, j] += R[l, i, 2] * body.local[j, 2]
-            distances_into(P, body.radius, obstacles, room.rho, rho)
+            distances_into(P, body.radius, obstacles, far, rho)
+            count_rooms(obstacles.room, rho)
             keep = share * min(free, body.skin.keep)
             most = max(keep - body.skin.overhang, share * min(free, BALLS))  # that is asked of the points themselves
             for j in range(m):

@@ -17,7 +17,7 @@ from rtctl.arm import least_change
 from rtctl.arm.bounds import Bounds, approach_bound, jerk_along
 from rtctl.arm.field import NORMAL, RHO
 from rtctl.arm.least_change import COUNT, ROWS_MAX, STEPS, STEPS_MAX, Rows, add_row, dot, mobility
-from rtctl.arm.nearby import CHEAP, EXACT, MADE, Nearby, accelerate, towards
+from rtctl.arm.nearby import CHEAP, EXACT, KEPT, MADE, Nearby, accelerate, towards
 from rtctl.arm.scaling import scale_to_limits
 from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
@@ -70,7 +70,8 @@ def _make_candidate(s: Rows, c: int, near: Nearby, A_inv: F64) -> None:
     along = mobility(A_inv, s.C, r)
     if found.place[2, c] == CHEAP:
         jerk, speed = jerk_along(s.C, r, along, near.tau_rate), dot(s.C, r, near.qd)
-        found.most[c] = approach_bound(near.seen.pairs[k, RHO, j], speed, math.inf, near.braking, jerk)
+        room = near.seen.pairs[k, RHO, j] - near.seen.rooms[k, KEPT]
+        found.most[c] = approach_bound(room, speed, math.inf, near.braking, jerk)
         found.place[2, c] = EXACT
     if towards(c, near) > found.most[c]:
         add_row(s, found.most[c], along)

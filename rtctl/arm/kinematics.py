@@ -16,6 +16,7 @@ from rtctl.arm.task import selection, task_error
 from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64, Goal
 from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
+from rtctl.world.rooms import count_rooms, farthest
 
 REACHED = 1e-4  # [m], and ten times that [rad], of a posture that has a goal
 STEPS = 80  # of the inverse kinematics
@@ -177,10 +178,12 @@ def clearances(
 ) -> F64:
     """Return the least distance (b,) [m] of the points to any obstacle, at postures Q (b, n).
 
+    Of an obstacle with an influence and a clearance of its own it is that which the config's count (`rooms`).
     times (b,) [s]: how far ahead each is; obstacles are moved on at their speeds. cutoff [m]: what is beyond it may be
     less than true, never below it.
     """
     out, rho = np.empty(Q.shape[0]), np.empty((obstacles.active.shape[0], 4, radius.shape[0]))
+    far = farthest(obstacles.room, obstacles.active, cutoff)
     for b in range(Q.shape[0]):
         p, R = obstacles.p, obstacles.R
         if times[b] != 0.0:
@@ -195,10 +198,12 @@ def clearances(
             obstacles.dims,
             obstacles.group,
             obstacles.margin,
+            obstacles.room,
             obstacles.mesh,
             obstacles.clouds,
         )
-        distances_into(points_at(chain, link, local, Q[b]), radius, at, cutoff, rho)
+        distances_into(points_at(chain, link, local, Q[b]), radius, at, far, rho)
+        count_rooms(at.room, rho)
         out[b] = _least(rho)
     return out
 

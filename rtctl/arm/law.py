@@ -54,6 +54,7 @@ from rtctl.arm.osc import (
 )
 from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
 from rtctl.arm.scaling import scale_drive_to_limits, scale_to_limits
+from rtctl.control.firas import ROOM
 from rtctl.kernel import kernel, leaf_kernel
 from rtctl.types import F64, I32, I64, LimitFlag, Record, RecordRow
 from rtctl.world.primitives import Obstacles
@@ -289,6 +290,11 @@ def _params(c: RecordRow, n: int) -> _Params:
             c.avoid_v_smooth,
             c.avoid_m_max,
             c.avoid_forms,
+            c.avoid_v_max,
+            c.avoid_damping_ratio,
+            c.avoid_dt,
+            c.avoid_added,
+            c.avoid_overhang,
         ),
         FieldParams(
             c.own_rho0,
@@ -300,6 +306,11 @@ def _params(c: RecordRow, n: int) -> _Params:
             c.own_v_smooth,
             c.own_m_max,
             c.own_forms,
+            c.own_v_max,
+            c.own_damping_ratio,
+            c.own_dt,
+            c.own_added,
+            c.own_overhang,
         ),
         LimitParams(
             c.limit_rho0[:n],
@@ -377,7 +388,7 @@ def work_sizes(slots: int, m: int, n: int, pairs: int) -> tuple[int, int]:
 def _work_in(memory: WorkMemory, slots: int, m: int, n: int, pairs: int) -> _Work:
     """Return the law's arrays in the memory; see `work_sizes`."""
     c, known = min(slots * m, CANDIDATES_MAX), TIP_ROWS + pairs
-    a, b = n + slots * (5 + n + 6 * m) + 15 * m, slots * (3 + m)
+    a, b = n + slots * (5 + n + ROOM + 6 * m) + 15 * m, slots * (3 + m)
     most = a + (_ROWS + known) * n
     real = most + known
     rows = real + c + 4 * m + n + 1
@@ -483,7 +494,7 @@ def _let_pass(constants: Record, cover: Cover, seen: Field, model: Model, motion
     """Return whether no bound is passed; then row _SENT of the work is what may be sent."""
     c, w = constants[0], work.w
     near = _near(constants, cover, seen, model, motion, work)
-    work.whole[-1] = look_near(near, APPROACH_ZONE * c.avoid_rho0)
+    work.whole[-1] = look_near(near, APPROACH_ZONE)
     near = _near(constants, cover, seen, model, motion, work)
     inertia, motors = Inertia(model.A, model.A_inv), Motors(w[_LOAD], c.tau_max[: motion.q.shape[0]])
     return let_pass(inertia, motors, w[_SUM], _bounds(w, work.most), near, w[_SENT : _LESS + 1])

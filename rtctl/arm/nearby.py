@@ -19,6 +19,7 @@ CANDIDATES_MAX = 2048  # points near obstacles that are looked at; what comes la
 # of a candidate's bound: below the true one; the true one; and its row is at hand
 CHEAP, EXACT, MADE = 0, 1, 2
 _BELOW = 1.0 - 1e-9  # takes a bound of the jerk below what rounding may have added to it
+KEPT = 5  # of Field.rooms: [m] that an approach is stopped before
 _V, _B = 3, 6  # rows of Field.points: velocity, mobility
 
 
@@ -54,14 +55,17 @@ def nearby_in(
 
 
 @leaf_kernel
-def candidates(seen: Field, points: MovingPoints, zone: float, out: Candidates) -> int:
-    """List the points nearer than `zone` [m] to an obstacle that are the nearest of their link, or nearly so.
+def candidates(seen: Field, points: MovingPoints, share: float, out: Candidates) -> int:
+    """List the points within a share of an obstacle's influence that are the nearest of their link, or nearly so.
 
     Returns how many: of each obstacle and link the nearest point and those within LINK_BAND of it, in the zone.
     """
     count = 0
     for k in range(seen.leader.shape[0]):
-        if seen.leader[k] < 0 or not seen.rho_min[k] < zone:
+        if seen.leader[k] < 0:
+            continue
+        zone = share * seen.rooms[k, 0] + seen.rooms[k, KEPT]
+        if not seen.rho_min[k] < zone:
             continue
         first, end = count, count
         for i in range(seen.near_count[k]):
@@ -107,17 +111,17 @@ def cheap_bounds(size: int, near: Nearby) -> None:
         b = x * x * X[_B, j] + y * y * X[_B + 1, j] + z * z * X[_B + 2, j]
         b += 2.0 * (x * y * X[_B + 3, j] + x * z * X[_B + 4, j] + y * z * X[_B + 5, j])
         jerk = _BELOW * JERK_SHARE * max(b, 0.0) / out.points[3, j]
-        bound = approach_bound(seen.pairs[k, RHO, j], speed, math.inf, near.braking, jerk)
+        bound = approach_bound(seen.pairs[k, RHO, j] - seen.rooms[k, KEPT], speed, math.inf, near.braking, jerk)
         out.most[c] = bound - 1e-9 * (1.0 + abs(bound))
 
 
 @leaf_kernel
-def look_near(near: Nearby, zone: float) -> int:
-    """List the points that approach an obstacle nearer than `zone` [m], with cheap bounds; return how many.
+def look_near(near: Nearby, share: float) -> int:
+    """List the points that approach an obstacle within a share of its influence, with cheap bounds; return how many.
 
     It is the arm's own approach -n . Jp qd alone that is bounded; what comes towards it is for the field to flee.
     """
-    size = candidates(near.seen, near.points, zone, near.found)
+    size = candidates(near.seen, near.points, share, near.found)
     cheap_bounds(size, near)
     return size
 

@@ -25,6 +25,7 @@ from rtctl.arm.model import Model
 from rtctl.arm.sensing import Surroundings
 from rtctl.kernel import kernel
 from rtctl.types import F64, Feedback, RecordRow, Severity, State
+from rtctl.world.rooms import OWN_CLEARANCE, OWN_INFLUENCE
 
 BRAKING, LOWERING, SINKING = 1, 2, 3  # phases; 0: the drives' loops are not used
 HOLD_TIME = 1.0  # [s] in which the joints come to rest and are held before they are lowered
@@ -132,12 +133,13 @@ def _obstructed(c: RecordRow, m: RecordRow, around: Surroundings, u: F64) -> boo
     """Return whether something that is known lies under the arm: lowered at u (n,) [rad/s] it comes no further."""
     if m.present & _CONTACT:
         return True
-    power, near = 0.0, np.inf
+    power, near, room = 0.0, False, around.obstacles.room
     for k in range(around.rho.shape[0]):
-        near = min(near, around.rho[k])
+        clearance = room[k, OWN_CLEARANCE] if room[k, OWN_INFLUENCE] != 0.0 else c.avoid_rho_min
+        near |= around.rho[k] < 2.0 * clearance
     for i in range(u.shape[0]):
         power += m.tau_obstacles[i] * u[i]
-    return bool(near < 2.0 * c.avoid_rho_min and power < 0.0)
+    return bool(near and power < 0.0)
 
 
 @kernel

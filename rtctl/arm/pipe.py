@@ -38,6 +38,7 @@ from rtctl.arm.servo_level import (
 from rtctl.arm.supervision import hold_at, supervise, with_advice, with_goal
 from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, leads, pursues
 from rtctl.arm.task import between, point_of
+from rtctl.control.firas import rooms_of
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.types import (
     F64,
@@ -143,7 +144,9 @@ def initial(robot: Robot, feedback: Feedback) -> Memory:
     """Return the memory before the first tick: IDLE, at rest where the feedback says the arm is."""
     q, zero = feedback.q.copy(), np.zeros(robot.n)
     model = robot.body.evaluate(q, zero, robot.points, robot.own)
-    table = obstacle_table.empty(robot.slots, robot.meshes, robot.safety.creep, robot.safety.feed_timeout)
+    table = obstacle_table.empty(
+        robot.slots, robot.meshes, robot.safety.creep, robot.safety.feed_timeout, rooms_of(robot.avoid)
+    )
     table = obstacle_table.with_static(table, robot.obstacles)
     far = np.full(robot.slots, np.inf)
     parameters = parameters_of(model, int(robot.axes), TOOL_Z, robot.motion)
@@ -283,7 +286,9 @@ def _with_blockers(robot: Robot, m: Memory, found: diagnosis.Blockers) -> Memory
 def _caught(robot: Robot, m: Memory, record: Record, goal: Goal, error: float) -> Memory:
     """Return the memory of an arm that has just come to rest: where obstacles hold it, with an escape begun."""
     found = diagnosis.blockers(_balance(robot, m, record))
-    near = {Status.LOCAL_MINIMUM: robot.avoid.rho0, Status.SHADOWED: 2.0 * robot.avoid.rho0}
+    by_obstacles = found.status in (Status.LOCAL_MINIMUM, Status.SHADOWED) and found.main >= 0
+    rho0 = float(diagnosis.influences(robot, m)[found.main]) if by_obstacles else robot.avoid.rho0
+    near = {Status.LOCAL_MINIMUM: rho0, Status.SHADOWED: 2.0 * rho0}
     if not found.mask or error < near.get(found.status, np.inf):
         return _with_status(m, Status.MOVING)
     begun = escape.begun(m.escape, error, escape.push_of(m.model, m.tau_obstacles, goal))

@@ -36,6 +36,7 @@ from rtctl.kernel.reductions import all_equal, any_set
 from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Status, Task
 from rtctl.world.obstacle_table import distances_from, margins
 from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
+from rtctl.world.rooms import widest
 
 # where a call begins
 START, MEASURED, DECIDED = 0, 1, 2
@@ -229,7 +230,7 @@ def _ahead(arm: Arm, m: RecordRow, obstacles: Obstacles, ends: F64, n: int) -> A
         nowhere = Ends(points[:0], np.empty((0, 0)), 0.0, APART, 0.0, ends[:0])
         return Ahead(nowhere, c.limit_rho0[:n].copy(), False, np.zeros(n))
     found = np.empty((obstacles.active.shape[0], 4, points.shape[0]))
-    distances_into(points.T.copy(), arm.radius, obstacles, rho0, found)
+    distances_into(points.T.copy(), arm.radius, obstacles, widest(obstacles.room, obstacles.active, rho0), found)
     # the points stand out of the links: where the links themselves are known to keep the clearance, points need not
     measured = m.has_posture == MEASURED_POSTURE
     least, beside = (THINNEST, BESIDE) if measured else (LEAST_REACH * c.avoid_rho_min, 0.0)

@@ -141,6 +141,7 @@ def _add_obstacle(commands: Commands) -> None:
         "obstacle",
         "set or clear an obstacle",
         "rtctl obstacle set ball sphere radius_m=0.05 position_m=0.4,0,0.5 velocity_m_s=0,0.1,0\n"
+        "  rtctl obstacle set lamp sphere radius_m=0.1 position_m=0.6,0,0.5 influence_m=0.2 clearance_m=0.06\n"
         "  rtctl obstacle clear ball",
     )
     actions = parser.add_subparsers(metavar="ACTION", dest="action", required=True)
@@ -154,7 +155,8 @@ def _add_obstacle(commands: Commands) -> None:
         f"  {kind:12} {keys}" for kind, keys in KEYS_OF.items()
     )
     setter.description += (
-        "\n\nand of all: position_m, rpy_rad or wxyz, velocity_m_s, omega_rad_s, group, combine=union|sum.\n"
+        "\n\nand of all: position_m, rpy_rad or wxyz, velocity_m_s, omega_rad_s, group, combine=union|sum,\n"
+        "influence_m, clearance_m: where its field begins, and what the arm keeps of it; without them as in [avoid].\n"
         "A mesh is one that the daemon's config names in a [[mesh]]; a cloud's file is read here, thinned and sent."
     )
     add_daemon(setter)

@@ -15,6 +15,7 @@ from rtctl.arm.robot import Robot
 from rtctl.arm.task import turns
 from rtctl.cli.goals import send
 from rtctl.cli.parser import daemon_of
+from rtctl.control.firas import rooms_of
 from rtctl.design.arm import loaded_shape
 from rtctl.design.assets import Assets, load_assets
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError, UsageError
@@ -69,7 +70,8 @@ def _described(arguments: argparse.Namespace, robot: Robot) -> tuple[F64, Obstac
         assets = load_assets((), scenario.obstacle, Path(arguments.scenario), robot.meshes)
         edits = tuple(ObstacleEdit(o.name, loaded_shape(o, assets)) for o in scenario.obstacle if o.appears_s == 0.0)
         start = start if start is not None else scenario.start_q_rad
-    table = obstacle_table.with_static(obstacle_table.empty(robot.slots, assets.meshes), robot.obstacles)
+    empty = obstacle_table.empty(robot.slots, assets.meshes, of_all=rooms_of(robot.avoid))
+    table = obstacle_table.with_static(empty, robot.obstacles)
     table, refusal = obstacle_table.edited(table, edits)
     if refusal:
         raise RequestError(f"{arguments.scenario}: {refusal}")

@@ -15,7 +15,9 @@ import numpy as np
 
 from rtctl.kernel import leaf_kernel
 from rtctl.types import F64, I64
+from rtctl.world.rooms import Rooms
 
+ROOM = 6  # numbers of a row of Field.rooms
 CAP_SHARE = 0.5  # of the clearance, where the repulsion is capped at the latest
 CAPPED, CONTACT = 1, 2  # flags: some counted distance below rho_num; at or below 0
 SUM, TASK = 1, 2  # of FieldParams.forms: terms of a link's points added plainly; the whole inertia of a point
@@ -33,6 +35,11 @@ class FieldParams(NamedTuple):
     v_smooth: float  # [m/s] below it that widening starts as a parabola
     m_max: float  # [kg] bound of the effective mass lambda
     forms: float  # SUM and TASK, whichever apply, added; 0: blended, and the mass along the normal
+    v_max: float  # [m/s] these were made for, as the next three
+    damping_ratio: float
+    dt: float  # [s]
+    added: float  # how many terms one link may sum
+    overhang: float = 0.0  # [m] by which points stand out of links at most
 
 
 class LimitParams(NamedTuple):
@@ -55,6 +62,7 @@ class Field(NamedTuple):
     pairs: F64  # (K, 6, m) rho [m] (beyond the influence maybe a lower bound), normal, a [m/s2], lambda (a + d) [N]
     points: F64  # (15, m) position, velocity, mobility xx yy zz xy xz yz, force
     share: F64  # (K, n + 1) sum of a over the points of a link
+    rooms: F64  # (K, 6) rho0, rho_min, rho_num, eta, k_d as of FieldParams, and what the guards keep [m]
     leader: I64  # (K,) first near slot of the group, -1 when not near
     near: I64  # (K, m) points within the widest influence of the obstacle, ascending; the first `near_count` are meant
     near_count: I64  # (K,) how many; of slots that are not near: anything
@@ -72,6 +80,7 @@ def field_buffers(slots: int, m: int, n: int) -> Field:
         z((slots, 6, m)),
         z((15, m)),
         z((slots, n + 1)),
+        z((slots, ROOM)),
         z(slots, whole),
         z((slots, m), whole),
         z(slots, whole),
@@ -126,7 +135,14 @@ def field_params(
     Raises ValueError unless 0 < rho_num < rho_min < rho0.
     """
     rho_num, eta, k_d = _derived(v_max, rho0, rho_min, dt, damping_ratio, added)
-    return FieldParams(rho0, rho_min, rho_num, eta, k_d, look_ahead, 0.1 * v_max, m_max, float(forms))
+    return FieldParams(
+        rho0, rho_min, rho_num, eta, k_d, look_ahead, 0.1 * v_max, m_max, float(forms), v_max, damping_ratio, dt, added
+    )
+
+
+def rooms_of(params: FieldParams) -> Rooms:
+    """Return what holds for obstacles without numbers of their own, and what the rate can hold of those with some."""
+    return Rooms(params.rho0, params.rho_min, math.sqrt(3.0 * params.added) * params.dt * params.v_max)
 
 
 def limit_params(qd_max: F64, rho0: F64, rho_min: F64, dt: float, damping_ratio: float) -> LimitParams:
@@ -142,6 +158,26 @@ def limit_params(qd_max: F64, rho0: F64, rho_min: F64, dt: float, damping_ratio:
             raise ValueError(f"joint {i}: {error}") from None
     rho_num, eta, k_d = np.array(rows).T.copy()
     return LimitParams(np.array(rho0, np.float64), np.array(rho_min, np.float64), rho_num, eta, k_d)
+
+
+@leaf_kernel
+def put_room(params: FieldParams, influence: float, clearance: float, rooms: F64, k: int) -> None:
+    """Write row k of Field.rooms for an obstacle of these numbers [m], of the params' own where they are 0.
+
+    As `field_params` derives them. The guards of an obstacle with a clearance of its own keep it between obstacle and
+    links: points stand out of links, so that they may come nearer by the overhang.
+    """
+    rooms[k, 0], rooms[k, 1], rooms[k, 2] = params.rho0, params.rho_min, params.rho_num
+    rooms[k, 3], rooms[k, 4], rooms[k, 5] = params.eta, params.k_d, 0.0
+    if influence == 0.0:
+        return
+    slope = params.v_max / (1.0 / clearance - 1.0 / influence)
+    eta, dt, added = slope * slope, params.dt, params.added
+    rho_num = math.sqrt(math.sqrt(3.0 * added * eta * dt * dt))
+    k_d = 2.0 * params.damping_ratio * math.sqrt(3.0 * eta) / (clearance * clearance)
+    rooms[k, 0], rooms[k, 1], rooms[k, 2] = influence, clearance, max(rho_num, CAP_SHARE * clearance)
+    rooms[k, 3], rooms[k, 4] = eta, min(k_d, 0.5 / (added * dt))
+    rooms[k, 5] = max(clearance - params.overhang, 0.0)
 
 
 # error_model: every divisor is a validated parameter or bounded by one; the check for zero would stop vectorisation.

@@ -27,6 +27,7 @@ from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
 from rtctl.arm.robot import Robot, StopParams
 from rtctl.arm.self_collision import Own, nothing
+from rtctl.control.firas import rooms_of
 from rtctl.design import points as psp
 from rtctl.design.assets import Assets, load_assets, placed
 from rtctl.design.description import notes
@@ -38,7 +39,7 @@ from rtctl.kernel.rotations import R_of
 from rtctl.protocol import mit
 from rtctl.spec import rules
 from rtctl.spec.goal import task_of
-from rtctl.spec.obstacles import Obstacle, quaternion, shape_of
+from rtctl.spec.obstacles import Obstacle, quaternion, refuse_rooms, shape_of
 from rtctl.spec.read import name_place
 from rtctl.spec.robot import Config, GripperTable
 from rtctl.spec.urdf import package_folders, urdf_file
@@ -99,6 +100,8 @@ def build(config: Config, path: str | Path) -> Robot:
     assets = load_assets(config.mesh, config.obstacle, Path(path))
     obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
     _refuse_contact(obstacles, assets, body, points, home, source)
+    avoid = _obstacle_field(config, points, source)._replace(overhang=coverage.overhang)
+    refuse_rooms(config.obstacle, rooms_of(avoid), source)
     rest = config.motion.posture.q_rest_rad
     tau_rated = np.array([j.tau_max_Nm for j in joints])
     robot = Robot(
@@ -137,7 +140,7 @@ def build(config: Config, path: str | Path) -> Robot:
         obstacles=obstacles,
         meshes=assets.meshes,
         motion=_motion(config),
-        avoid=_obstacle_field(config, points, source),
+        avoid=avoid,
         postures=config.avoid.posture == "auto",
         plans=config.avoid.plan == "auto",
         escape=config.avoid.escape,

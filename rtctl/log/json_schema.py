@@ -51,6 +51,8 @@ _SHAPE = _object(
     omega=_list(_NUMBER, "(3,) [rad/s]"),
     group=_STRING,
     mesh=_STRING,
+    influence=_is("number", "[m] of its own; the config's where it has none"),
+    clearance=_is("number", "[m] likewise"),
     cloud=_is("string", "int16 steps of each point, little-endian", contentEncoding="base64"),
 )
 _REQUEST = _object(

@@ -15,10 +15,11 @@ from rtctl.errors import ConfigError
 from rtctl.protocol.mavlink_budget import MOST, SCANS, Streams, baud_of, fitted
 from rtctl.protocol.signing import KEY
 from rtctl.rover.occupancy import CELL, STENCIL
-from rtctl.spec.obstacles import Name, Obstacle, refuse_obstacles
+from rtctl.spec.obstacles import Name, Obstacle, refuse_obstacles, refuse_rooms
 from rtctl.spec.read import name_place, parse, read
 from rtctl.spec.robot import ConsoleTable, LogTable, Table, Text
 from rtctl.spec.rules import Found
+from rtctl.world import rooms
 
 Metre = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Id = Annotated[int, Meta(ge=1, le=255)]
@@ -194,6 +195,7 @@ def load(path: str | Path) -> BaseConfig:
         for found in group(config):
             raise ConfigError(name_place(str(path), found.path), found.got, found.wanted)
     refuse_obstacles(config.obstacle, str(path))
+    refuse_rooms(config.obstacle, rooms.NONE, str(path))
     for i, o in enumerate(config.obstacle):
         if o.waypoints or any((*o.velocity_m_s, *o.omega_rad_s)) or o.appears_s > 0.0 or o.vanishes_s < 1e6:
             place = name_place(str(path), f"obstacle[{i}].name")

@@ -13,6 +13,7 @@ from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of, exp3, quat_of
 from rtctl.spec.read import name_place
 from rtctl.types import F64, Shape
+from rtctl.world.rooms import CLEARANCE, INFLUENCE, Rooms, fault_of_room
 
 Name = Annotated[str, Meta(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]*$")]
 Coordinate = Annotated[float, Meta(ge=-9000.0, le=9000.0)]
@@ -54,6 +55,9 @@ class Posed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
     vanishes_s: Time = 1e6
     group: Name | None = None
     combine: Literal["union", "sum"] | None = None  # None: union, if there is a group
+    # as of [avoid], which hold without them; of an arm's obstacles alone
+    influence_m: Annotated[float, Meta(ge=INFLUENCE[0], le=INFLUENCE[1])] | None = None
+    clearance_m: Annotated[float, Meta(ge=CLEARANCE[0], le=CLEARANCE[1])] | None = None
 
 
 class Sphere(Posed, tag="sphere", frozen=True, kw_only=True):
@@ -266,6 +270,8 @@ def shape_of(obstacle: Obstacle, t: float = 0.0) -> Shape:
         omega=np.array(obstacle.omega_rad_s),
         group="" if obstacle.group is None or obstacle.combine == "sum" else obstacle.group,
         mesh=mesh_key(obstacle) if isinstance(obstacle, Mesh) else "",
+        influence=obstacle.influence_m or 0.0,
+        clearance=obstacle.clearance_m or 0.0,
     )
 
 
@@ -285,6 +291,8 @@ def contradiction(o: Obstacle) -> tuple[str, object, str] | None:
         return "vanishes_s", o.vanishes_s, f"more than appears_s = {o.appears_s:g}"
     if o.combine is not None and o.group is None:
         return "combine", o.combine, "a group beside it"
+    if o.influence_m is not None and o.clearance_m is not None and o.clearance_m >= o.influence_m:
+        return "clearance_m", o.clearance_m, f"less than influence_m = {o.influence_m:g}"
     if isinstance(o, Mesh) and (o.mesh is None) == (o.file is None):
         return "mesh", "neither it nor file" if o.mesh is None else f"{o.mesh} and a file", "one of the two"
     if isinstance(o, Mesh) and o.mesh is not None and (o.hull or o.scale != 1.0):
@@ -327,3 +335,10 @@ def refuse_obstacles(obstacles: tuple[Obstacle, ...], source: str, one: bool = F
             if how != (obstacle.combine or "union"):
                 place = name_place(source, f"{inside}combine")
                 raise ConfigError(place, obstacle.combine or "union", f"{how}, as the rest of group {obstacle.group}")
+
+
+def refuse_rooms(obstacles: tuple[Obstacle, ...], rooms: Rooms, source: str) -> None:
+    """Raise ConfigError for the first obstacle whose own influence or clearance the robot cannot give it."""
+    for i, o in enumerate(obstacles):
+        if found := fault_of_room(o.influence_m or 0.0, o.clearance_m or 0.0, rooms):
+            raise ConfigError(name_place(source, f"obstacle[{i}].{found[0]}"), found[1], found[2])

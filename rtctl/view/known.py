@@ -28,7 +28,9 @@ def known_obstacles(world: Json) -> list[Known]:
             continue
         pose = {"position": rows["p"][k], "wxyz": list(quaternion(np.array(rows["R"][k])))}
         motion = {"velocity": rows["v"][k], "omega": rows["w"][k]}
-        found.append(Known(int(world["slots"][k]), {"name": str(name), **shape, **pose, **motion}))
+        influence, clearance = rows["room"][k][:2] if "room" in rows else (0.0, 0.0)  # a daemon of before has none
+        room = {"influence": float(influence), "clearance": float(clearance)} if influence else {}
+        found.append(Known(int(world["slots"][k]), {"name": str(name), **shape, **pose, **motion, **room}))
     return found
 
 

@@ -16,6 +16,7 @@ from rtctl.view.follow import CELL, Story
 from rtctl.view.moment import Moment, Reader
 from rtctl.view.shapes import ball, triangles
 
+SHOWN = ("type", "dims", "mesh", "cloud", "influence")  # of an obstacle: another is drawn anew
 TOLD, OWN, SHELL = (70, 120, 225), (150, 155, 165), (225, 140, 40)  # obstacles told, of the config; influence
 GOAL, AHEAD, BEHIND, FORCE, SPHERE, SEEN = (
     (40, 165, 80),
@@ -187,7 +188,7 @@ class Stage:
         for name, (thing, is_fixed) in things.items():
             told = thing.shape
             have = self._things.get(name)
-            if have is None or any(have.told.get(key) != told.get(key) for key in ("type", "dims", "mesh", "cloud")):
+            if have is None or any(have.told.get(key) != told.get(key) for key in SHOWN):
                 if have is not None:
                     have.frame.remove()
                 have = self._things[name] = self._thing(name, thing, is_fixed)
@@ -198,7 +199,8 @@ class Stage:
 
     def _thing(self, name: str, thing: Thing, is_fixed: bool) -> _Thing:
         frame = self.scene.add_frame(f"/obstacles/{name}", show_axes=False)
-        body, shell = triangles(thing.shape, thing.boxes), triangles(thing.shape, thing.boxes, self.reader.influence)
+        reach = float(thing.shape.get("influence") or self.reader.influence)
+        body, shell = triangles(thing.shape, thing.boxes), triangles(thing.shape, thing.boxes, reach)
         colour = OWN if is_fixed else TOLD
         if body is not None:
             is_plane = thing.shape.get("type") == "plane"

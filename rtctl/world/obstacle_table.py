@@ -7,7 +7,7 @@ import numpy as np
 
 from rtctl.kernel import kernel, reductions
 from rtctl.types import B1, F64, ObstacleEdit, Shape
-from rtctl.world import meshes
+from rtctl.world import meshes, rooms
 from rtctl.world.meshes import Meshes
 from rtctl.world.primitives import (
     CLOUDS,
@@ -21,6 +21,7 @@ from rtctl.world.primitives import (
     obstacles_empty,
     put_shape,
 )
+from rtctl.world.rooms import Rooms
 
 EASE = 0.25  # of its growth with which a margin falls again: given back at once, every observation would be a blow
 SLOTS = 64
@@ -43,12 +44,19 @@ class World(NamedTuple):
     known: Meshes
     creep: float  # [m/s] speed that obstacles may have beside the one that is told
     stale: float  # [s] age at which an observation is too old
+    of_all: Rooms = rooms.NONE  # influence and clearance of obstacles without their own
 
 
-def empty(slots: int = SLOTS, known: Meshes = meshes.NONE, creep: float = 0.0, stale: float = 0.5) -> World:
+def empty(
+    slots: int = SLOTS,
+    known: Meshes = meshes.NONE,
+    creep: float = 0.0,
+    stale: float = 0.5,
+    of_all: Rooms = rooms.NONE,
+) -> World:
     """Return a table without obstacles; `known` are the meshes that obstacles may refer to."""
     no, none = np.zeros(slots, np.bool_), ("",) * slots
-    return World(obstacles_empty(slots, known), none, np.zeros(slots), no, no, none, known, creep, stale)
+    return World(obstacles_empty(slots, known), none, np.zeros(slots), no, no, none, known, creep, stale, of_all)
 
 
 def with_static(world: World, shapes: tuple[Shape, ...]) -> World:
@@ -94,7 +102,7 @@ def _refused(world: World, edit: ObstacleEdit, slots: list[int]) -> str:
         return "" if slots or all_of_them else f"no obstacle is named {edit.name}"
     if not slots and "" not in world.names:
         return f"obstacle {edit.name}: all {len(world.names)} slots are taken"
-    fault = fault_of(shape, world.known)
+    fault = fault_of(shape, world.known, world.of_all)
     if not fault and shape.type == "cloud":
         slot = slots[0] if slots else world.names.index("")
         fault = f"there are {CLOUDS} clouds already" if cloud_place(world.obstacles, slot) < 0 else ""
@@ -108,7 +116,7 @@ def _refused(world: World, edit: ObstacleEdit, slots: list[int]) -> str:
 def _put(world: World, slot: int, edit: ObstacleEdit, shape: Shape) -> World:
     """Write a shape without fault, `edit.age` [s] on, into a slot of a table whose arrays are the caller's own."""
     shape = shape._replace(position=shape.position + edit.age * shape.velocity)
-    obstacles = put_shape(world.obstacles, slot, shape, world.known)
+    obstacles = put_shape(world.obstacles, slot, shape, world.known, world.of_all)
     world.age[slot] = edit.age
     world.moving[slot] = edit.feed or any(shape.velocity.tolist()) or any(shape.omega.tolist())
     grown = max(world.creep * min(edit.age, world.stale), float(obstacles.margin[slot]))
@@ -185,7 +193,7 @@ def nearest_of(world: World, edit: ObstacleEdit, P: F64, radius: F64) -> tuple[f
 
     inf and -1 where there is no shape, or none that the table would take: `edited` says why.
     """
-    there, refusal = edited(empty(1, world.known), (edit,))
+    there, refusal = edited(empty(1, world.known, of_all=world.of_all), (edit,))
     if refusal or edit.shape is None:
         return math.inf, -1
     rho = np.array([distance_from(there, x)[0] for x in P]) - radius

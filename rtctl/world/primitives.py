@@ -28,8 +28,9 @@ from rtctl.kernel import kernel, leaf_kernel
 from rtctl.kernel.rotations import R_of, compose, exp3
 from rtctl.types import B1, F64, I64, Shape
 from rtctl.world import distance as exact
-from rtctl.world import meshes, tree
+from rtctl.world import meshes, rooms, tree
 from rtctl.world.meshes import Meshes
+from rtctl.world.rooms import Rooms, fault_of_room, room_of
 from rtctl.world.superquadric import n_surface
 
 SPHERE, CAPSULE, PLANE, BOX, CONE, SUPERQUADRIC, MESH, CLOUD = range(8)
@@ -74,6 +75,7 @@ class Obstacles(NamedTuple):
     # meshes (0, 0, reach, start in `mesh`, 0), clouds (radius, 0, reach, index in `clouds`, 0)
     group: I64  # (K,) equal: parts of one union, the nearest counts; different: forces add
     margin: F64  # (K,) [m] by which the surface is taken to be nearer: what an old observation does not know
+    room: F64  # (K, 4) [m] influence and clearance of its own, and of the config; see `rooms`
     mesh: F64  # bodies of `bvh`, those of the robot: never changes
     clouds: tuple[F64, F64, F64, F64]  # bodies of `bvh`; a new cloud is a new array in its place
 
@@ -90,12 +92,13 @@ def obstacles_empty(slots: int, known: Meshes = meshes.NONE) -> Obstacles:
         np.ones((slots, 5)),
         np.arange(slots),
         np.zeros(slots),
+        np.zeros((slots, 4)),
         known.data,
         (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
     )
 
 
-def fault_of(shape: Shape, known: Meshes = meshes.NONE) -> str:
+def fault_of(shape: Shape, known: Meshes = meshes.NONE, of_all: Rooms = rooms.NONE) -> str:
     """Return what is wrong with a shape as one line that names the field, or "" when it can be used."""
     if shape.type not in _TYPES:
         return f"type: got {shape.type!r}, wanted one of {', '.join(TYPES)}"
@@ -110,6 +113,8 @@ def fault_of(shape: Shape, known: Meshes = meshes.NONE) -> str:
         return f"cloud: got {len(shape.cloud)} bytes, wanted 6 for each of 1 to {CLOUD_POINTS} points"
     if shape.type == "cloud" and not STEP_MIN <= shape.dims[1] <= STEP_MAX:
         return f"dims[1]: got a step of {shape.dims[1]} m, wanted {STEP_MIN} to {STEP_MAX}"
+    if found := fault_of_room(shape.influence, shape.clearance, of_all):
+        return f"{found[0]}: got {found[1]:g}, wanted {found[2]}"
     return _fault_of_dims(shape)
 
 
@@ -166,23 +171,29 @@ def cloud_place(obstacles: Obstacles, slot: int) -> int:
 
 
 def with_shape(
-    obstacles: Obstacles, slot: int, shape: Shape, group: int = -1, known: Meshes = meshes.NONE
+    obstacles: Obstacles,
+    slot: int,
+    shape: Shape,
+    group: int = -1,
+    known: Meshes = meshes.NONE,
+    of_all: Rooms = rooms.NONE,
 ) -> Obstacles:
     """Return the obstacles with `shape` in `slot`; `group` -1 = one of its own (the slot's index).
 
-    known: the meshes that the obstacles were made with. Raises ValueError with `fault_of(shape)` on a shape that cannot
-    be used, and on one cloud too many; ask first where that is a value.
+    known: the meshes that the obstacles were made with; of_all: influence and clearance without its own. Raises
+    ValueError with `fault_of(shape)` on a shape that cannot be used, and on one cloud too many; ask first where that is
+    a value.
     """
-    fault = fault_of(shape, known)
+    fault = fault_of(shape, known, of_all)
     if fault or (shape.type == "cloud" and cloud_place(obstacles, slot) < 0):
         raise ValueError(fault or f"cloud: there are {CLOUDS} already")
-    new = put_shape(copied(obstacles), slot, shape, known)
+    new = put_shape(copied(obstacles), slot, shape, known, of_all)
     new.group[slot] = slot if group < 0 else group
     new.margin[slot] = 0.0
     return new
 
 
-def put_shape(new: Obstacles, slot: int, shape: Shape, known: Meshes) -> Obstacles:
+def put_shape(new: Obstacles, slot: int, shape: Shape, known: Meshes, of_all: Rooms = rooms.NONE) -> Obstacles:
     """Write a shape without fault into a slot of arrays that are the caller's own; group and margin stay."""
     place = cloud_place(new, slot) if shape.type == "cloud" else 0
     new.kind[slot] = _TYPES[shape.type][0]
@@ -192,6 +203,7 @@ def put_shape(new: Obstacles, slot: int, shape: Shape, known: Meshes) -> Obstacl
     new.v[slot] = shape.velocity
     new.w[slot] = shape.omega
     new.dims[slot] = _stored_dims(shape)
+    new.room[slot] = room_of(shape.influence, shape.clearance, of_all)
     if shape.type == "mesh":
         start = known.start(shape.mesh)
         new.dims[slot] = 0.0, 0.0, known.data[start + 2], start, 0.0
@@ -217,6 +229,7 @@ def copied(obstacles: Obstacles) -> Obstacles:
         o.dims.copy(),
         o.group.copy(),
         o.margin.copy(),
+        o.room.copy(),
         o.mesh,
         o.clouds,
     )
@@ -358,5 +371,6 @@ def distances(P: F64, radius: F64, obstacles: Obstacles) -> tuple[F64, F64]:
 
 def distance(shape: Shape, P: F64, known: Meshes = meshes.NONE) -> tuple[F64, F64]:
     """Return exact (rho (m,), normal (m, 3)) of points P (m, 3) [m] to one shape; `known` are the robot's meshes."""
-    rho, normal = distances(P, np.zeros(P.shape[0]), with_shape(obstacles_empty(1, known), 0, shape, known=known))
+    there = with_shape(obstacles_empty(1, known), 0, shape._replace(influence=0.0, clearance=0.0), known=known)
+    rho, normal = distances(P, np.zeros(P.shape[0]), there)
     return rho[0], np.ascontiguousarray(normal[0].T)

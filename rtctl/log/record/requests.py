@@ -69,7 +69,8 @@ def _plain(value: object) -> object:
 
 
 def _shape(shape: Shape) -> Json:
-    return {k: _plain(v) for k, v in shape._asdict().items()}
+    own = {"influence": shape.influence, "clearance": shape.clearance}
+    return {k: _plain(v) for k, v in shape._asdict().items() if own.get(k, 1.0)}  # as before there were such
 
 
 def _shape_of(body: Json) -> Shape:
@@ -85,6 +86,8 @@ def _shape_of(body: Json) -> Shape:
         str(body.get("group", "")),  # logs of before there were such have none
         str(body.get("mesh", "")),
         base64.b64decode(body.get("cloud", ""), validate=True),  # as on the wire: 60 kB at most
+        float(body.get("influence", 0.0)),
+        float(body.get("clearance", 0.0)),
     )
 
 
