@@ -18,7 +18,7 @@ from tests.arms import panda, states
 from tests.lab import PANDA, Run, changed, play, robot
 
 FAR = np.full(4, np.inf)
-NOTHING = Balance(np.zeros(4), np.zeros(7), 0.0, 1.0, np.full(7, 0.1), FAR, 0.1, False)
+NOTHING = Balance(np.zeros(4), np.zeros(7), 0.0, 1.0, np.full(7, 0.1), FAR, np.full(4, 0.1), False)
 BESIDE = [0.0639, -0.0741, 0.4370, -2.2232, 0.0376, 2.1557, 1.2645]  # the hand points down at 0.45 0.25 0.3
 
 

@@ -12,7 +12,7 @@ import pytest
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
-from rtctl.app.postures import endings, site_of, skin_of
+from rtctl.app.postures import SLOTS, endings, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
@@ -194,7 +194,7 @@ def test_where_points_stand_out_too_far_the_links_themselves_are_measured():
 def seen(q: list[float], goal: Goal, *shapes: Shape, tick: int = 0, status: Status = Status.MOVING) -> Seen:
     used = len(shapes)
     o = around(*shapes)
-    cut = o._replace(**{k: getattr(o, k)[:used] for k in o._fields[:9]})
+    cut = o._replace(**{k: getattr(o, k)[:used] for k in SLOTS})
     return Seen(tick, State.RUN, status, goal, np.array(q), cut)
 
 
