@@ -47,10 +47,12 @@ class Data(NamedTuple):
 def run(say: Say = unsaid, pairs: tuple[tuple[int, int], ...] = PAIRS) -> Data:
     """Play the same two goals at each pair of rates, with the estimator and without it."""
     cases = [(servo, model, carry) for servo, model in pairs for carry in (True, False)]
-    config, runs = config_file("panda"), []
-    for k, case in enumerate(cases):
-        runs.append(_played(config, *case, lambda part, k=k: say((k + part) / len(cases))))  # type: ignore[misc]
-    return Data(runs)
+    config = config_file("panda")
+
+    def saying(k: int) -> Say:
+        return lambda part: say((k + part) / len(cases))
+
+    return Data([_played(config, *case, saying(k)) for k, case in enumerate(cases)])
 
 
 def _played(config: Path, servo: int, model: int, carry: bool, say: Say) -> Run:

@@ -163,7 +163,7 @@ def dtype_from_json(text: str) -> np.dtype[np.void]:
 
 def header_to_json(header: Header) -> str:
     """Return the header as JSON text, for the ring and for the log's metadata."""
-    raw = header._replace(dtype=dtype_to_json(header.dtype))._asdict()  # type: ignore[arg-type]
+    raw = {**header._asdict(), "dtype": dtype_to_json(header.dtype)}
     return json.dumps({**raw, "files": {name: _to_text(content) for name, content in header.files.items()}})
 
 

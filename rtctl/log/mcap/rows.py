@@ -36,13 +36,14 @@ def rows_for(parts: Sequence[tuple[int, Layout]]) -> Rows:
     for number, (_, layout) in enumerate(parts):
         fields += [(f"head{number}", MESSAGE), (f"body{number}", layout.wire)]
     dtype = np.dtype(fields)
+    assert dtype.fields is not None
     template = np.zeros(dtype.itemsize, np.uint8)
     row = template.view(dtype)
     for number, (channel, layout) in enumerate(parts):
         head = row[f"head{number}"]
         head["op"], head["channel"] = OP_MESSAGE, channel
         head["length"] = MESSAGE.itemsize - 9 + layout.wire.itemsize
-        start = dtype.fields[f"body{number}"][1]  # type: ignore[index]
+        start = dtype.fields[f"body{number}"][1]
         template[start : start + layout.wire.itemsize] = layout.template
     return Rows(template, dtype)
 

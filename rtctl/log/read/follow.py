@@ -1,9 +1,10 @@
 """Following a log while it is written: what each new chunk of the growing file holds."""
 
 import contextlib
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from mcap import records
@@ -19,6 +20,7 @@ from rtctl.log.read.reader import read
 from rtctl.log.read.topic import Part, Topic
 from rtctl.plain import Json
 
+T = TypeVar("T")
 MOST = 2 * limits.CHUNK  # [bytes] read at a look
 
 
@@ -132,8 +134,12 @@ class Tail:
             at = rows.offset[mine] + RECORD.size + MESSAGE.size
             part = Part(content, at, rows.size[mine], rows.time[mine], rows.sequence[mine])
             dtype = self.header.dtype if channel.topic == schema.TICK else None
-            topics.append(Topic(channel.topic, channel, "", dtype, lambda work, part=part: [work(part)]))  # type: ignore[misc]
+            topics.append(Topic(channel.topic, channel, "", dtype, partial(_worked, part)))
         return topics
+
+
+def _worked(part: Part, work: Callable[[Part], T]) -> list[T]:
+    return [work(part)]
 
 
 def newest(folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -80,11 +81,15 @@ class _Turns:
         return self.spans
 
 
+def _when_set(name: str, value: int) -> str:
+    return name if value else ""
+
+
 class _Bits:
     """Spans in which a bit was set."""
 
     def __init__(self, names: dict[int, str]) -> None:
-        self._turns = {bit: _Turns(lambda v, name=name: name if v else "") for bit, name in names.items()}  # type: ignore[misc]
+        self._turns = {bit: _Turns(partial(_when_set, name)) for bit, name in names.items()}
 
     def add(self, time: F64, values: Array) -> None:
         for bit, turns in self._turns.items():
