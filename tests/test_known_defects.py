@@ -65,7 +65,7 @@ def interpreted(patch: Patch) -> None:
         patch.setattr(law, part, getattr(law, part).py_func)
     patch.setattr(law, "law", lambda constants, *rest: whole(constants.view(np.recarray), *rest))
     patch.setattr(servo_level, "law", law.law)
-    patch.setattr(servo_level, "_act", servo_level._act.py_func)
+    patch.setattr(servo_level, "act", servo_level.act.py_func)
     patch.setattr(pipe, "servo", servo_level.servo.py_func)
 
 
@@ -187,7 +187,7 @@ def test_avoidance_goes_before_the_goal(monkeypatch: Patch):
         return out
 
     monkeypatch.setattr(servo_level, "law", in_the_null_space)
-    monkeypatch.setattr(servo_level, "_act", servo_level._act.py_func)
+    monkeypatch.setattr(servo_level, "act", servo_level.act.py_func)
     monkeypatch.setattr(pipe, "servo", servo_level.servo.py_func)  # looks its parts up when it runs
     assert not the_arm_stops_before_a_ball_on_its_line()
 

@@ -194,6 +194,7 @@ ROVER = Vehicle(
     tx=MAV_TX,
     load=load,
     warm=warm,
+    warm_second=warm,
     bounds=bounds,
     initial=initial,
     tick=lambda base, memory, feedback, request: tick(base, memory, feedback, request),  # looked up when called

@@ -1,7 +1,7 @@
 """Compilation ahead of the first run: two processes that share the kernels between them, told as they go.
 
 The caches of the kernels let each be compiled once: who comes second waits and loads it. So both processes go through
-the same work in another order.
+the same work in another order, and where a kernel is large, each begins with another part of it.
 """
 
 import hashlib
@@ -21,6 +21,7 @@ from rtctl.kernel.cache import folder
 from rtctl.spec.base import is_base
 
 POLL = 0.25  # [s] between two looks at what was compiled: a look takes time from the compilers
+PARTS = "first", "second"  # of the two processes
 KEPT = 50  # marks of what was warmed
 _ROOT = Path(__file__).resolve().parents[1]
 _KERNEL = re.compile(rb"^@(?:ieee_|leaf_)?kernel\b", re.MULTILINE)
@@ -45,8 +46,7 @@ def warm(config: str | Path, told: Callable[[int], None]) -> None:
     env = {**os.environ, "NUMBA_CACHE_DIR": str(folder())}
     command = [sys.executable, "-m", "rtctl.app.warm", str(config)]
     jobs = [
-        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=env)
-        for part in ("robot", "world")
+        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=env) for part in PARTS
     ]
     try:
         while any(job.poll() is None for job in jobs):
@@ -99,12 +99,13 @@ def _written(entry: os.DirEntry[str]) -> float:
     return 0.0
 
 
-def _robot(config: Path) -> None:
-    """Build the robot and let its tick do every kind of work."""
+def _robot(config: Path, second: bool) -> None:
+    """Build the robot and let its tick do every kind of work, in the order of one of the two processes."""
     from rtctl.app.choose import vehicle_of
 
     vehicle = vehicle_of(config)
-    vehicle.warm(vehicle.load(config, None).build())
+    robot = vehicle.load(config, None).build()
+    (vehicle.warm_second if second else vehicle.warm)(robot)
 
 
 def _world() -> None:
@@ -126,6 +127,7 @@ def _world() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[2] == "world":
+    second = sys.argv[2] == PARTS[1]
+    if not second:
         _world()
-    _robot(Path(sys.argv[1]))
+    _robot(Path(sys.argv[1]), second)

@@ -13,7 +13,7 @@ from rtctl.arm import diagnosis, escape
 from rtctl.arm.escape import Escape
 from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
-from rtctl.arm.flat import parameters_of, shapes_of, table_of
+from rtctl.arm.flat import model_in, parameters_of, shapes_of, table_of
 from rtctl.arm.gripper import DRIVEN, gripped, refused, silent, unasked
 from rtctl.arm.law import REVIEW
 from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
@@ -32,13 +32,17 @@ from rtctl.arm.servo_level import (
     REQUEST,
     START,
     WORLD,
+    Asked,
+    act,
     asking,
     servo,
+    surroundings,
 )
 from rtctl.arm.supervision import hold_at, supervise, with_advice, with_goal
 from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, leads, pursues
 from rtctl.arm.task import between, point_of
 from rtctl.control.firas import rooms_of
+from rtctl.kernel import compile_for
 from rtctl.kernel.rotations import exp3, quat_of
 from rtctl.types import (
     F64,
@@ -302,11 +306,11 @@ def _meshes_at(robot: Robot, position: np.ndarray, wxyz: np.ndarray) -> list[Sha
     return [Shape("mesh", "mesh", zero, position, wxyz, zero[:3], zero[:3], mesh=name) for name in names]
 
 
-def warm(robot: Robot) -> None:
-    """Run the tick through every kind of work once, so that nothing is compiled or loaded while the arm moves."""
+def _resting(robot: Robot) -> Feedback:
+    """Return what drives say of an arm that rests at home."""
     n = robot.n
     zero = np.zeros(n)
-    feedback = Feedback(
+    return Feedback(
         0,
         0,
         robot.home.copy(),
@@ -319,6 +323,20 @@ def warm(robot: Robot) -> None:
         0.0,
         0.0,
     )
+
+
+def warm_second_half(robot: Robot) -> None:
+    """Compile the second half of the servo level alone: another process is at the first half meanwhile."""
+    feedback = _resting(robot)
+    m = initial(robot, feedback)
+    model, space = model_in(m.parameters, robot.n, len(robot.points.radius))
+    around = surroundings(m.table, m.shapes, (m.placed.obstacles.mesh, m.placed.obstacles.clouds))
+    compile_for(act, robot.arm, record_of(m.hot)[0], model, space, around, feedback, Asked(0, 0, 0), m.ends)
+
+
+def warm(robot: Robot) -> None:
+    """Run the tick through every kind of work once, so that nothing is compiled or loaded while the arm moves."""
+    feedback = _resting(robot)
     m = initial(robot, feedback)
     far = np.array([0.0, 0.0, 50.0])
     wxyz = np.array([1.0, 0.0, 0.0, 0.0])

@@ -240,7 +240,7 @@ def _ahead(arm: Arm, m: RecordRow, obstacles: Obstacles, ends: F64, n: int) -> A
 
 
 @kernel
-def _act(
+def act(
     arm: Arm,
     m: RecordRow,
     model: Model,
@@ -321,6 +321,15 @@ def _act(
 
 
 @kernel
+def surroundings(table: F64, shapes: F64, bodies: BODIES) -> Surroundings:
+    """Return the obstacles of a table and its shapes, see `flat`."""
+    obstacles, moving = obstacles_in(table, shapes, bodies)
+    return Surroundings(
+        obstacles, moving, row_of(table, AGE), row_of(table, RHO), row_of(table, GOAL_RHO), shapes[-2], shapes[-1]
+    )
+
+
+@kernel
 def servo(
     arm: Arm,
     before: F64,
@@ -344,12 +353,9 @@ def servo(
     memory, table, wish = before.copy(), table_before.copy(), Asked(asked & 3, asked >> 2 & 63, asked >> 8)
     m = memory.view(HOT)[0]
     model, space = model_in(parameters, feedback.q.shape[0], arm.radius.shape[0])
-    obstacles, moving = obstacles_in(table, shapes, bodies)
-    around = Surroundings(
-        obstacles, moving, row_of(table, AGE), row_of(table, RHO), row_of(table, GOAL_RHO), shapes[-2], shapes[-1]
-    )
+    around = surroundings(table, shapes, bodies)
     flags = _sense(arm.constants[0], m, feedback, model, around, wish) if wish.stage != DECIDED else DONE
     if flags & (MODEL | ATTENTION):
         return memory, table, np.empty(0, np.uint32), flags
-    raw, more = _act(arm, m, model, space, around, feedback, wish, ends)
+    raw, more = act(arm, m, model, space, around, feedback, wish, ends)
     return memory, table, raw, flags | more

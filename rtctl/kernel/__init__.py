@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Literal, ParamSpec, TypeVar
+from typing import Literal, ParamSpec, Protocol, TypeVar, cast
 
-from numba import njit
+from numba import njit, typeof
 
 from rtctl.kernel.cache import install
 
@@ -45,3 +45,13 @@ def _compiled(function: Callable[_P, _R], errors: Literal["python", "numpy"], co
         with suppress(LookupError):  # a script's or a shell's own kernels are compiled each time
             install(compiled, function)
     return compiled
+
+
+class _Compiled(Protocol):
+    def compile(self, signature: tuple[object, ...]) -> object: ...
+
+
+def compile_for(function: Callable[..., object], *values: object) -> None:
+    """Compile a kernel for arguments of the types that these values have, without a call of it."""
+    types = tuple(typeof(value) for value in values)  # type: ignore[no-untyped-call]
+    cast(_Compiled, function).compile(types)
