@@ -15,12 +15,19 @@ import pytest
 
 from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
+from rtctl.design import kept
 from rtctl.design.points import coverage, given, place
 from rtctl.errors import ConfigError
 from rtctl.types import F64
 from tests.arms import CROOKED, CROOKED_JOINTS, crooked, panda, states
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spheres are placed anew in each test."""
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path)
 
 
 @cache
@@ -154,7 +161,8 @@ def _digest() -> str:
 
 def test_another_process_places_the_same_spheres_to_the_bit() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONHASHSEED": "7"}
-    script = "from tests.test_points import _digest; print(_digest())"
+    anew = "from rtctl.design import kept; kept.read = lambda path: None"
+    script = f"{anew}; from tests.test_points import _digest; print(_digest())"
     run = subprocess.run([sys.executable, "-c", script], env=environment, cwd=ROOT, capture_output=True, text=True)
     assert run.stdout.strip().splitlines()[-1:] == [_digest()], run.stderr
 
@@ -229,3 +237,54 @@ def test_a_link_in_other_units_than_metres_is_refused_before_it_is_cut_into_tria
     huge.write_text(CROOKED.replace('<sphere radius="0.06"/>', f'<sphere radius="{radius}"/>'))
     with pytest.raises(ConfigError, match="from its joint, wanted at most 5 m"):
         place(RigidBody.from_urdf(huge, CROOKED_JOINTS, "tip", np.eye(4)))
+
+
+def same(a: tuple[Points, Coverage], b: tuple[Points, Coverage]) -> bool:
+    alike = all(np.array_equal(x, y) for x, y in zip(a[0], b[0], strict=True))
+    return alike and a[1] == b[1]
+
+
+def test_what_was_placed_is_kept_to_the_bit_by_all_that_decides_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = crooked(tmp_path)
+    made = place(body, 0.04)
+    with monkeypatch.context() as patch:
+        patch.setattr("rtctl.design.points._placed", None)
+        assert same(place(body, 0.04), made)
+        with pytest.raises(TypeError):
+            place(body, 0.03)
+        patch.setattr(kept, "stamp", lambda *_: "other sources")
+        with pytest.raises(TypeError):
+            place(body, 0.04)
+    assert not same(place(body, 0.03), made)
+    other = tmp_path / "other.urdf"
+    other.write_text(CROOKED.replace('<sphere radius="0.06"/>', '<sphere radius="0.061"/>'))
+    assert not same(place(RigidBody.from_urdf(other, CROOKED_JOINTS, "tip", np.eye(4)), 0.04), made)
+
+
+@pytest.mark.parametrize("damage", ["", "{}", "[1]", '{"link": [1]}', "\x00"])
+def test_a_file_that_is_damaged_is_made_anew(tmp_path: Path, damage: str) -> None:
+    body = crooked(tmp_path)
+    made = place(body, 0.04)
+    (path,) = (tmp_path / "points").iterdir()
+    path.write_text(damage)
+    assert same(place(body, 0.04), made)
+    assert kept.read(path) is not None
+
+
+def test_where_nothing_can_be_written_spheres_are_placed_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = crooked(tmp_path)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path / "file")
+    assert len(place(body, 0.04)[0].radius)
+
+
+def test_the_latest_placements_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "KEPT", 2)
+    body = crooked(tmp_path)
+    for overhang in (0.04, 0.045, 0.05):
+        place(body, overhang)
+    assert len(list((tmp_path / "points").iterdir())) == 2

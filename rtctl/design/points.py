@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
+from rtctl.design import kept
 from rtctl.design.solids import EDGE, STEP, Solid, areas, depth, solids_of, surface
 from rtctl.errors import ConfigError
 from rtctl.kernel import kernel
@@ -30,6 +31,18 @@ def place(body: RigidBody, overhang: float = 0.025) -> tuple[Points, Coverage]:
     solids = [s for s in solids_of(body) if s.link > 0]
     if not solids:
         raise ConfigError("avoid.points", "no collision geometry in the URDF", "a list of points")
+    path = kept.place_of(solids, overhang, __name__, __file__)
+    before = kept.read(path)
+    if before is not None:
+        return before
+    points = _placed(solids, overhang)
+    found = coverage(points, body, min(EDGE, 0.6 * overhang))
+    kept.write(path, points, found)
+    return points, found
+
+
+def _placed(solids: list[Solid], overhang: float) -> Points:
+    """Return the spheres that cover the solids, link by link."""
     links: list[int] = []
     centres: list[F64] = []
     radii: list[float] = []
@@ -42,8 +55,7 @@ def place(body: RigidBody, overhang: float = 0.025) -> tuple[Points, Coverage]:
         centres += list(c)
         radii += list(r)
         names += [pieces[k].name for k in np.argmax(depths, axis=0)]
-    points = Points(np.array(links, dtype=np.int64), np.array(centres), np.array(radii), tuple(names))
-    return points, coverage(points, body, min(EDGE, 0.6 * overhang))
+    return Points(np.array(links, dtype=np.int64), np.array(centres), np.array(radii), tuple(names))
 
 
 def given(body: RigidBody, entries: Sequence[tuple[str, F64, float]]) -> tuple[Points, Coverage]:
