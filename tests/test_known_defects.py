@@ -60,7 +60,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
 def interpreted(patch: Patch) -> None:
     """Let the law look its parts up when it runs, so that one of them can be exchanged."""
     whole = law.law.py_func
-    parts = "_work_in rows_in _params _motion_limits _torques _bound _bounds _approach _near nearby_in"
+    parts = "_work_in rows_in params_of motion_limits _torques _bound _bounds approach_params _near nearby_in"
     for part in (*parts.split(), "_slewed", "_let_pass", "_hold_back"):
         patch.setattr(law, part, getattr(law, part).py_func)
     patch.setattr(law, "law", lambda constants, *rest: whole(constants.view(np.recarray), *rest))

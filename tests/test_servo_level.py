@@ -52,7 +52,7 @@ def session() -> Iterator[Memory]:
 
 def test_plain_python_computes_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled = list(session())
-    for name in ("_sense", "act", "_limited", "_move", "_uneventful", "_stop_torque", "_torque_asked", "observe"):
+    for name in ("_sense", "act", "limited", "_move", "_uneventful", "_stop_torque", "_torque_asked", "observe"):
         monkeypatch.setattr(servo_level, name, getattr(servo_level, name).py_func)
     monkeypatch.setattr(pipe, "servo", servo_level.servo.py_func)  # type: ignore[attr-defined]
     assert same(list(session()), compiled)

@@ -33,7 +33,7 @@ from rtctl.arm import faults, task
 from rtctl.arm.gripper import ASKED, SEEN, TARGET, TAU, TORQUE, Gripper, Q, state_of
 from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
 from rtctl.arm.memory import Memory, places_of
-from rtctl.arm.pipe import initial, tick, warm, warm_second_half
+from rtctl.arm.pipe import compile_part, initial, tick, warm
 from rtctl.arm.robot import Robot
 from rtctl.hal.can.transport import InProcess
 from rtctl.hal.clock import Slot
@@ -204,10 +204,10 @@ def _warm(robot: Robot) -> None:
     guide.warm(robot)
 
 
-def _warm_second(robot: Robot) -> None:
-    warm_second_half(robot)
-    guide.warm(robot)
-    warm(robot)
+def _compile_part(robot: Robot, part: int) -> None:
+    compile_part(robot, part)
+    if part == 0:
+        guide.warm(robot)
 
 
 def misplaced(robot: Robot, m: Memory, edit: ObstacleEdit) -> str:
@@ -277,7 +277,7 @@ ARM = Vehicle(
     tx=CAN_TX,
     load=load,
     warm=_warm,
-    warm_second=_warm_second,
+    compile_part=_compile_part,
     bounds=lambda robot, link: Bounds(
         tuple(robot.base.tolist()), robot.reach, robot.tolerance, robot.tolerance_rot, robot.axes
     ),

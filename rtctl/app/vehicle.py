@@ -218,7 +218,7 @@ class Vehicle(NamedTuple, Generic[R, M, F, C]):
     tx: int
     load: Callable[[Path, float | None], Setup[R, M, F, C]]  # [s] to wait for the vehicle, None: as the file says
     warm: Callable[[R], None]  # compile and load everything that a tick needs
-    warm_second: Callable[[R], None]  # the same in another order, for a second process beside the first
+    compile_part: Callable[[R, int], None]  # 0 or 1: what each of two processes compiles first
     bounds: Callable[[R, Link[F, C]], Bounds]  # of goals
     initial: Callable[[R, F], M]
     tick: Callable[[R, M, F, Request], tuple[M, C, Record]]

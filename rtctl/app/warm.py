@@ -1,9 +1,10 @@
 """Compilation ahead of the first run: two processes that share the kernels between them, told as they go.
 
 The caches of the kernels let each be compiled once: who comes second waits and loads it. So both processes go through
-the same work in another order, and where a kernel is large, each begins with another part of it.
+the same work, and each begins with another part of it.
 """
 
+import gc
 import hashlib
 import os
 import re
@@ -21,8 +22,8 @@ from rtctl.kernel.cache import folder
 from rtctl.spec.base import is_base
 
 POLL = 0.25  # [s] between two looks at what was compiled: a look takes time from the compilers
-PARTS = "first", "second"  # of the two processes
 KEPT = 50  # marks of what was warmed
+GARBAGE = 500_000  # objects made between two collections: a compiler keeps what it makes, looking for garbage took 6 %
 _ROOT = Path(__file__).resolve().parents[1]
 _KERNEL = re.compile(rb"^@(?:ieee_|leaf_)?kernel\b", re.MULTILINE)
 
@@ -46,7 +47,8 @@ def warm(config: str | Path, told: Callable[[int], None]) -> None:
     env = {**os.environ, "NUMBA_CACHE_DIR": str(folder())}
     command = [sys.executable, "-m", "rtctl.app.warm", str(config)]
     jobs = [
-        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=env) for part in PARTS
+        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=env)
+        for part in ("0", "1")
     ]
     try:
         while any(job.poll() is None for job in jobs):
@@ -99,13 +101,14 @@ def _written(entry: os.DirEntry[str]) -> float:
     return 0.0
 
 
-def _robot(config: Path, second: bool) -> None:
-    """Build the robot and let its tick do every kind of work, in the order of one of the two processes."""
+def _robot(config: Path, part: int) -> None:
+    """Build the robot and let its tick do every kind of work, a part of it first."""
     from rtctl.app.choose import vehicle_of
 
     vehicle = vehicle_of(config)
     robot = vehicle.load(config, None).build()
-    (vehicle.warm_second if second else vehicle.warm)(robot)
+    vehicle.compile_part(robot, part)
+    vehicle.warm(robot)
 
 
 def _world() -> None:
@@ -127,7 +130,8 @@ def _world() -> None:
 
 
 if __name__ == "__main__":
-    second = sys.argv[2] == PARTS[1]
-    if not second:
+    gc.set_threshold(GARBAGE)
+    part = int(sys.argv[2])
+    if part == 0:
         _world()
-    _robot(Path(sys.argv[1]), second)
+    _robot(Path(sys.argv[1]), part)

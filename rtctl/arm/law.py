@@ -11,22 +11,19 @@ import numpy as np
 
 from rtctl.arm.bounds import (
     TIP_ROWS,
-    ApproachParams,
     Bounds,
-    MotionLimits,
     SelfPairs,
     TipMotion,
     joint_bounds,
     self_bounds,
     tip_bounds,
 )
-from rtctl.arm.escape import STALL
+from rtctl.arm.constants import approach_params, constants_of, motion_limits, params_of
 from rtctl.arm.field import (
     APART,
     CAPPED,
     Ends,
     Field,
-    FieldParams,
     LimitParams,
     MovingPoints,
     field_to,
@@ -43,7 +40,6 @@ from rtctl.arm.osc import (
     POSTURE_SPRING,
     TASK_BRAKE,
     TASK_DRIVE,
-    MotionParams,
     OperationalSpace,
     TaskDynamics,
     Twist,
@@ -52,7 +48,7 @@ from rtctl.arm.osc import (
     motion_torque,
     velocity_reference,
 )
-from rtctl.arm.robot import JOINTS_MAX, Arm, Robot
+from rtctl.arm.robot import Arm, Robot
 from rtctl.arm.scaling import scale_drive_to_limits, scale_to_limits
 from rtctl.control.firas import ROOM
 from rtctl.kernel import kernel, leaf_kernel
@@ -61,14 +57,6 @@ from rtctl.world.primitives import Obstacles
 
 _CAP, _SPEED, _SINGULAR = (int(c) for c in (LimitFlag.FIELD_CAP, LimitFlag.SPEED, LimitFlag.SINGULAR))
 _SCALED = int(LimitFlag.MOTION_SCALED)
-
-
-REVIEW = 0.5  # [s] between two diagnoses of an arm that rests
-_BARE = (  # of Robot
-    "q_min", "q_max", "qd_max", "tau_max", "tau_rate", "tau_lsb", "braking", "viscous", "q_rest", "dt", "model_dt",
-    "carry", "escape", "payload_max", "friction_max", "noticeable", "tolerance", "tolerance_rot", "coulomb",
-    "viscous_told", "collision", "collision_hard", "brakeless",
-)  # fmt: skip
 
 # rows of Law.torques, (7, n) [Nm]; the first five as the record has them
 MOTION = 0
@@ -195,140 +183,16 @@ def evaluate_law(robot: Robot, model: Model, space: OperationalSpace, obstacles:
 
 
 def prepared(robot: Robot) -> Robot:
-    """Return the robot with the constants of the law as one record: numba takes one array in a tenth of the time.
+    """Return the robot with the constants of the law as one record, and the memory that the law works in.
 
-    Arrays over joints are padded to JOINTS_MAX: one layout, whatever the arm. numba names compiled code by a number
-    that it gives each record type in each process, so that of two layouts from its cache one would run as the other.
     Whoever replaces a gain or bound of a robot prepares it anew.
     """
-    groups: dict[str, NamedTuple] = {
-        "motion": robot.motion,
-        "avoid": robot.avoid,
-        "own": robot.self_avoid,
-        "limit": robot.limit,
-        "estimator": robot.estimator,
-        "joint": robot.joint_filter,
-        "safety": robot.safety,
-        "stop": robot.stop,
-    }
-    values = {f"{group}_{k}": v for group, params in groups.items() for k, v in params._asdict().items()}
-    values |= {k: getattr(robot, k) for k in _BARE}
-    values |= {
-        "axes": int(robot.axes),
-        "escape_ticks": round(STALL / robot.dt),
-        "review_ticks": round(REVIEW / robot.dt),
-    }
-    constants = np.zeros(
-        1, np.dtype((np.record, [(k, np.float64, (JOINTS_MAX,) * np.ndim(v)) for k, v in values.items()]))
-    )
-    for k, v in values.items():
-        if np.ndim(v):
-            constants[k][0, : robot.n] = v
-        else:
-            constants[k] = v
+    constants = constants_of(robot)
     m = len(robot.points.radius)
     reals, wholes = work_sizes(robot.slots, m, robot.n, len(robot.own.pairs))
     work = np.zeros(reals), np.zeros(wholes, np.int64)
     arm = Arm(constants, robot.points.radius, robot.points.link, *work)
     return robot._replace(constants=constants, arm=arm, scratch=field_in(*work, robot.n, m, robot.slots))
-
-
-@kernel
-def motion_params(c: RecordRow) -> MotionParams:
-    """Return the parameters of the motion task in the record c; what it has of joints is padded."""
-    return MotionParams(
-        c.motion_k_p,
-        c.motion_k_v,
-        c.motion_v_max,
-        c.motion_a_max,
-        c.motion_w_max,
-        c.motion_alpha_max,
-        c.motion_k_q,
-        c.motion_d_q,
-        c.motion_qdd_posture,
-        c.motion_epsilon,
-        c.motion_length,
-        c.motion_speed_margin,
-    )
-
-
-class _Params(NamedTuple):
-    """The parameters that `prepared` put into its record."""
-
-    motion: MotionParams
-    avoid: FieldParams
-    self_collision: FieldParams
-    limit: LimitParams
-    dt: float
-
-
-@leaf_kernel
-def _params(c: RecordRow, n: int) -> _Params:
-    """Return the parameters of n joints in the record c."""
-    return _Params(
-        MotionParams(
-            c.motion_k_p,
-            c.motion_k_v,
-            c.motion_v_max,
-            c.motion_a_max,
-            c.motion_w_max,
-            c.motion_alpha_max,
-            c.motion_k_q,
-            c.motion_d_q,
-            c.motion_qdd_posture[:n],
-            c.motion_epsilon,
-            c.motion_length,
-            c.motion_speed_margin,
-        ),
-        FieldParams(
-            c.avoid_rho0,
-            c.avoid_rho_min,
-            c.avoid_rho_num,
-            c.avoid_eta,
-            c.avoid_k_d,
-            c.avoid_look_ahead,
-            c.avoid_v_smooth,
-            c.avoid_m_max,
-            c.avoid_forms,
-            c.avoid_v_max,
-            c.avoid_damping_ratio,
-            c.avoid_dt,
-            c.avoid_added,
-            c.avoid_overhang,
-        ),
-        FieldParams(
-            c.own_rho0,
-            c.own_rho_min,
-            c.own_rho_num,
-            c.own_eta,
-            c.own_k_d,
-            c.own_look_ahead,
-            c.own_v_smooth,
-            c.own_m_max,
-            c.own_forms,
-            c.own_v_max,
-            c.own_damping_ratio,
-            c.own_dt,
-            c.own_added,
-            c.own_overhang,
-        ),
-        LimitParams(
-            c.limit_rho0[:n],
-            c.limit_rho_min[:n],
-            c.limit_rho_num[:n],
-            c.limit_eta[:n],
-            c.limit_k_d[:n],
-        ),
-        c.dt,
-    )
-
-
-@leaf_kernel
-def _motion_limits(c: RecordRow, n: int, speed_scale: float, qd_max: F64) -> MotionLimits:
-    """Return the limits of n joints in the record c; qd_max (n,) is where the speeds of this tick are put."""
-    for i in range(n):
-        qd_max[i] = speed_scale * c.qd_max[i]
-    return MotionLimits(c.q_min[:n], c.q_max[:n], qd_max, c.braking[:n], c.tau_max[:n], c.tau_rate[:n])
 
 
 # rows of the work array of a tick, (rows, n): first the four of `osc.motion_torque`, last those of the bounds
@@ -421,7 +285,7 @@ def _torques(
     Returns the least distance between links [m], the flags of the field, and the share of what drives.
     """
     q, qd, n = motion.q, motion.qd, motion.q.shape[0]
-    p, limits = _params(constants[0], n), _motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
+    p, limits = params_of(constants[0], n), motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
     reference = Twist(task[6:9], task[9:12])
     velocity_reference(
         motion.error, motion.previous, motion.actual, space.Jbar, qd, limits.qd_max, p.motion, p.dt, reference
@@ -473,19 +337,19 @@ def _bounds(w: F64, most: F64) -> Bounds:
 def _bound(constants: Record, model: Model, motion: Motion, w: F64, most: F64) -> None:
     """Write the bounds of joints, tip and pairs of links; w is what `_torques` left."""
     n, bounds = motion.q.shape[0], _bounds(w, most)
-    p, limits = _params(constants[0], n), _motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
+    p, limits = params_of(constants[0], n), motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
     joint_bounds(model.A, motion.q, motion.qd, limits, bounds.low, bounds.high)
     tip = TipMotion(model.J, model.Jdqd, motion.actual.linear, motion.qdd)
     tip_bounds(tip, model.A_inv, p.motion.v_max, limits.tau_rate, bounds.rows, most)
     pairs = SelfPairs(model.own_rho, model.own_row, w[_DQ])
-    self_bounds(pairs, model.A_inv, motion.qd, _approach(constants[0]), limits.tau_rate, bounds)
+    self_bounds(pairs, model.A_inv, motion.qd, approach_params(constants[0]), limits.tau_rate, bounds)
 
 
 @leaf_kernel
 def _near(constants: Record, cover: Cover, seen: Field, model: Model, motion: Motion, work: _Work) -> Nearby:
     c = constants[0]
     points = MovingPoints(model.P, model.Jp, model.B, cover.radius, cover.link)
-    braking, tau_rate = _approach(c).braking, c.tau_rate[: motion.q.shape[0]]
+    braking, tau_rate = approach_params(c).braking, c.tau_rate[: motion.q.shape[0]]
     return nearby_in(work.whole, work.real, points, seen, motion.qd, braking, tau_rate)
 
 
@@ -529,11 +393,6 @@ def _slewed(c: RecordRow, sent: F64, w: F64) -> bool:
         w[_AIM, i] = w[_SENT, i]
         w[_SUM, i] = sent[i] + share * (w[_SENT, i] + w[_LOAD, i] - sent[i]) - w[_LOAD, i]
     return True
-
-
-@leaf_kernel
-def _approach(c: RecordRow) -> ApproachParams:
-    return ApproachParams(c.avoid_rho0, c.own_rho_min, c.motion_v_max, c.motion_a_max)
 
 
 @leaf_kernel

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from rtctl.arm import diagnosis, escape
+from rtctl.arm.constants import REVIEW
 from rtctl.arm.escape import Escape
 from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import model_in, parameters_of, shapes_of, table_of
 from rtctl.arm.gripper import DRIVEN, gripped, refused, silent, unasked
-from rtctl.arm.law import REVIEW
+from rtctl.arm.law import KEEP
 from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
 from rtctl.arm.model import Model
 from rtctl.arm.payload import with_payload
@@ -35,6 +36,8 @@ from rtctl.arm.servo_level import (
     Asked,
     act,
     asking,
+    held,
+    limited,
     servo,
     surroundings,
 )
@@ -325,13 +328,22 @@ def _resting(robot: Robot) -> Feedback:
     )
 
 
-def warm_second_half(robot: Robot) -> None:
-    """Compile the second half of the servo level alone: another process is at the first half meanwhile."""
+def compile_part(robot: Robot, part: int) -> None:
+    """Compile one of two parts of the servo level that take about as long, so that two processes share the work.
+
+    1: the second half of a tick, of which the law is the most. 0: what turns its torques into commands, which that half
+    comes to last.
+    """
     feedback = _resting(robot)
-    m = initial(robot, feedback)
-    model, space = model_in(m.parameters, robot.n, len(robot.points.radius))
-    around = surroundings(m.table, m.shapes, (m.placed.obstacles.mesh, m.placed.obstacles.clouds))
-    compile_for(act, robot.arm, record_of(m.hot)[0], model, space, around, feedback, Asked(0, 0, 0), m.ends)
+    memory = initial(robot, feedback)
+    m = record_of(memory.hot)[0]
+    model, space = model_in(memory.parameters, robot.n, len(robot.points.radius))
+    around = surroundings(memory.table, memory.shapes, (memory.placed.obstacles.mesh, memory.placed.obstacles.clouds))
+    if part == 1:
+        compile_for(act, robot.arm, m, model, space, around, feedback, Asked(0, 0, 0), memory.ends)
+        return
+    compile_for(limited, robot.arm.constants[0], m, feedback, model, np.zeros((KEEP + 1, robot.n)))
+    compile_for(held, robot.arm.constants[0], m, feedback, model, around)
 
 
 def warm(robot: Robot) -> None:

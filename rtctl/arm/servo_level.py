@@ -184,7 +184,7 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surrou
 
 
 @kernel
-def _held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings) -> tuple[int, F64]:
+def held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings) -> tuple[int, F64]:
     """Have the drives hold or lower the arm by their own loops; return types.Drive and the torque (n,) they give."""
     n, noticed = f.q.shape[0], m.noticed != 0
     own_loop(c, m, f, model, around, model.g - m.lasting[:n] if noticed else model.g)
@@ -199,7 +199,7 @@ def _held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroun
 
 
 @kernel
-def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
+def limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
     n, noticed = f.q.shape[0], m.noticed != 0
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
@@ -207,8 +207,8 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
         drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g - m.lasting[:n] if noticed else model.g)
     command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
     bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
-    limited, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
-    tau = limited.tau if command == _TORQUE else np.zeros(n)
+    within, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
+    tau = within.tau if command == _TORQUE else np.zeros(n)
     m.sent[1:, :n], m.sent[0, :n] = m.sent[:3, :n].copy(), tau
     m.qdd[:n] = 0.0
     if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
@@ -216,8 +216,8 @@ def _limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64
         m.qdd[:n] = acceleration(
             model.A_inv, tau, model.h, g + rubbing(c.coulomb[:n].copy(), np.zeros(n), qd), viscous, qd
         )
-    m.limit_flags, m.slew_follows_echo = limited.flags | m.limit_flags, 1 if follows else 0
-    return command, limited.tau_wanted
+    m.limit_flags, m.slew_follows_echo = within.flags | m.limit_flags, 1 if follows else 0
+    return command, within.tau_wanted
 
 
 @kernel
@@ -296,9 +296,9 @@ def act(
     if ahead.leads:  # and when it ends the tip goes on as it is
         m.v_ref[:], m.w_ref[:], m.lead[:n] = xd, omega, ahead.reference
     if holds_itself(c, m):
-        command, tau_wanted = _held(c, m, f, model, around)
+        command, tau_wanted = held(c, m, f, model, around)
     else:
-        command, tau_wanted = _limited(c, m, f, model, torques)
+        command, tau_wanted = limited(c, m, f, model, torques)
     pursued = target_of(m, m.has_goal != 0 and m.state == _RUN)
     p = progress_of(pursued.task, pursued.axis, pursued.position, pursued.wxyz, x, R, xd, omega)
     if m.parking != 0 and m.state == _RUN:

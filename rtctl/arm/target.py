@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.arm.constants import motion_params
 from rtctl.arm.escape import Escape, Phase, advance, push_along, way
 from rtctl.arm.faults import BRAKES
 from rtctl.arm.field import APART
-from rtctl.arm.law import motion_params
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.progress import GAIN, STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left

@@ -39,7 +39,7 @@ def leaf_kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def _compiled(function: Callable[_P, _R], errors: Literal["python", "numpy"], counting: bool) -> Callable[_P, _R]:
     # _nrt is always said: unsaid, a kernel takes it from the one that is compiled first to call it
     compiled: Callable[_P, _R] = njit(  # type: ignore[call-overload]
-        fastmath=False, error_model=errors, _nrt=counting, forceinline=not counting
+        fastmath=False, error_model=errors, _nrt=counting, forceinline=not counting, no_cfunc_wrapper=True
     )(function)
     if compiled is not function:  # it is, where NUMBA_DISABLE_JIT=1
         with suppress(LookupError):  # a script's or a shell's own kernels are compiled each time
