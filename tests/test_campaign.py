@@ -30,9 +30,9 @@ ROOT = Path(__file__).parents[1]
 SOURCE = "tests.campaign_source:source"
 
 
-def command(folder: Path, marks: Path, *more: str) -> list[str]:
+def command(folder: Path, marks: Path, *more: str, count: int = 6) -> list[str]:
     marks.mkdir(exist_ok=True)
-    return ["campaign", "run", SOURCE, "--count", "6", "--out", str(folder), "--option", f"marks={marks}", *more]
+    return ["campaign", "run", SOURCE, "--count", str(count), "--out", str(folder), "--option", f"marks={marks}", *more]
 
 
 def rows(folder: Path) -> dict[int, dict[str, Any]]:
@@ -53,14 +53,15 @@ def await_(what: Callable[[], bool], process: "subprocess.Popen[bytes]") -> None
 
 def test_two_workers_of_which_one_is_killed_give_what_one_process_gives(tmp_path: Path):
     here, there = tmp_path / "here", tmp_path / "there"
-    assert main(command(here, tmp_path / "a", "--workers", "0")) == 0
-    assert main(command(there, tmp_path / "b", "--workers", "2", "--option", "kill=3")) == 0
+    count = 3
+    assert main(command(here, tmp_path / "a", "--workers", "0", count=count)) == 0
+    assert main(command(there, tmp_path / "b", "--workers", "2", "--option", "kill=1", count=count)) == 0
     one, two = rows(here), rows(there)
     assert (tmp_path / "b" / "killed").exists()
-    assert set(one) == set(two) == set(range(6))
-    assert [one[k]["digest"] for k in range(6)] == [two[k]["digest"] for k in range(6)]
-    assert all(one[k]["digest"] for k in range(6))
-    assert plays(tmp_path / "a") == dict.fromkeys(range(6), 1)
+    assert set(one) == set(two) == set(range(count))
+    assert [one[k]["digest"] for k in range(count)] == [two[k]["digest"] for k in range(count)]
+    assert all(one[k]["digest"] for k in range(count))
+    assert plays(tmp_path / "a") == dict.fromkeys(range(count), 1)
 
 
 def test_a_campaign_beside_another_starts_without_a_word():
