@@ -58,7 +58,7 @@ def test_a_planned_way_is_clear_of_everything_by_coal_and_the_same_for_the_same_
     path = np.array([start, *(g.posture for g in goals)])
     model, data = arm.body.model, arm.body.model.createData()
     joints = {link: j for j, link in arm.body.link_of.items()}
-    boxes = [(coal.Box(*s.dims[:3]), coal.Transform3s(np.eye(3), s.position)) for s in shapes]
+    boxes = [(coal.Box(*(2.0 * s.dims[:3])), coal.Transform3s(np.eye(3), s.position)) for s in shapes]
     hulls = [h for h in hulls_of(arm.body) if h.link > 0]
     for a, b in pairwise(path):
         for part in np.linspace(0.0, 1.0, 4):
@@ -92,6 +92,36 @@ def test_an_arm_in_a_plane_is_led_around_along_the_axes_that_it_has():
         told = message_of(goal)
         assert told["axes"] == ["x", "y"]
         assert ("wxyz" in told) == bool(goal.task & Task.RZ)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_way_through_a_gap_is_found_whatever_the_seed(seed: int):
+    """Between two walls 0.4 m apart goes an arm whose links are 0.1 m thick; judged by coal."""
+    file = ROOT / "configs" / "planar4.toml"
+    arm = cfg.build(cfg.load(file), file)
+    size = np.array([0.25, 1.0, 0.3])
+    walls = [
+        Shape(f"wall {y}", "box", np.array([*size, 0.0]), np.array([1.0, y, 0.0]), UNIT, np.zeros(3), np.zeros(3))
+        for y in (-1.2, 1.2)
+    ]
+    start = np.array([2.2, 0.5, 0.5, 0.3])  # away from the walls, on their side of the arm's foot
+    obstacles = obstacle_table.with_static(obstacle_table.empty(arm.slots), tuple(walls)).obstacles
+    goals = plan(arm, start, to(1.7, 0.0, 0.0), obstacles, seed)
+    links = np.cumsum(goals[-1].posture)  # four links of 0.5 m
+    np.testing.assert_allclose(0.5 * np.array([np.cos(links).sum(), np.sin(links).sum()]), [1.7, 0.0], atol=2e-4)
+    model, data = arm.body.model, arm.body.model.createData()
+    joints = {link: j for j, link in arm.body.link_of.items()}
+    hulls = [h for h in hulls_of(arm.body) if h.link > 0]
+    boxes = [(coal.Box(*(2.0 * size)), coal.Transform3s(np.eye(3), w.position)) for w in walls]
+    for a, b in pairwise(np.array([start, *(g.posture for g in goals)])):
+        for part in np.linspace(0.0, 1.0, 6):
+            pin.forwardKinematics(model, data, a + part * (b - a))
+            for hull in hulls:
+                X = data.oMi[joints[hull.link]]
+                at = coal.Transform3s(X.rotation, X.translation)
+                for box, pose in boxes:
+                    d = coal.distance(hull.shape, at, box, pose, coal.DistanceRequest(), coal.DistanceResult())
+                    assert d > 0.8 * arm.avoid.rho_min
 
 
 def test_an_arm_folded_onto_itself_is_planned_for_from_where_it_is():

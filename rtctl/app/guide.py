@@ -29,6 +29,7 @@ from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
+from rtctl.arm.search import connected
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Advice, Goal, Shape, State, Status
@@ -86,7 +87,9 @@ def warm(robot: Robot) -> None:
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
     heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
     body, anchors = body_of(robot), robot.home[None]
-    first_blocked(body, anchors, site.obstacles, Room(0.0, 0.0, anchors, np.zeros((1, 2))), 1.0)
+    room = Room(0.0, 0.0, anchors, np.zeros((1, 2)))
+    first_blocked(body, anchors, site.obstacles, room, 1.0)
+    connected(body, anchors, np.zeros((0, robot.n)), site.obstacles, room, 1.0, 1, np.zeros(2, np.int64))
 
 
 class Guide:

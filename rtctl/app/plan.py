@@ -1,10 +1,11 @@
-"""The global planner: a far goal into a way of postures, or a stream of sub-goals for the goal interface (OMPL).
+"""The global planner: a far goal into a way of postures, or a stream of sub-goals for the goal interface.
 
-RRT-Connect over the joints; a posture is free when every point subjected to the potential keeps a clearance from every
-obstacle, no two links come near, and no joint enters its limit zone. The clearance begins at the field's influence, so
-that a planned path feels no repulsion at all, and is relaxed in steps where there is no room for that; near the start
-and the goal it falls to what these have. Edges are tested by one compiled call each. Seeded: equal inputs give equal
-paths.
+RRT-Connect over the joints: OMPL's where there is much room; where there is little, one that is compiled whole
+(`search`), since a narrow way takes many looks. A posture is free when every point subjected to the potential keeps a
+clearance from every obstacle, no two links come near, and no joint enters its limit zone. The clearance begins at the
+field's influence, so that a planned path feels no repulsion at all, and is relaxed in steps where there is no room for
+that; near the start and the goal it falls to what these have. Edges are tested by one compiled call each. Seeded: equal
+inputs give equal paths.
 """
 
 import time
@@ -20,6 +21,7 @@ from rtctl.arm.freedom import Body, Room, body_of, first_blocked
 from rtctl.arm.kinematics import clearance_of
 from rtctl.arm.model import Model
 from rtctl.arm.robot import Robot
+from rtctl.arm.search import connected
 from rtctl.arm.task import within as able
 from rtctl.design.report import WAY_ROOM
 from rtctl.errors import PlanError
@@ -31,8 +33,12 @@ ROOM = (1.0, 0.65, 0.4, 0.25, 0.0)  # fractions of influence and limit zone that
 EDGE = 0.06  # [rad] between two checked postures of an edge
 FINE = 0.015  # [rad] between those of the finished path
 BETWEEN = 0.8  # fraction of the room that a finished path has between the postures of its edges
-HARDER = 6  # times as many starts and edges, in the last of these steps
-CHECKS = 1500  # edges looked at, a step of ROOM
+HARDER = 6  # times as many starts, in the last of these steps
+CHECKS = 1500  # edges looked at, in the first of these steps
+LOOKS = {0.65: 10, 0.4: 10, 0.25: 40, 0.0: 40}  # times as many postures, in the others
+AROUND = (0.5, 1.0, 2.0)  # [rad] around start and ends that samples are drawn from, in turn: joints that may turn
+# twice have a hundred times more room elsewhere
+REACH = 1.0  # [rad] towards a sample
 WITHIN = 60.0  # [s]; a plan that takes longer depends on the machine
 NEAREST = 0.8  # of the field's clearance that a goal posture should have
 THERE = 0.01  # [m] tolerance of a sub-goal, which is passed long before
@@ -68,17 +74,22 @@ def plan_joints(site: Site, goal: Goal, seed: int, checks: int = CHECKS, within:
     end, why = time.monotonic() + within, ""
     util.noOutputHandler()
     for share in ROOM:
-        harder = 1 if share else HARDER
-        ends, why = _goal_postures(site, goal, share, seed, harder * SEEDS)
+        ends, why = _goal_postures(site, goal, share, seed, (1 if share else HARDER) * SEEDS)
         free = _Free(site, share, ends)
-        path = _searched(site, ends, free, seed, partial(_spent, free, harder * checks, end))
-        if path is not None:
-            path = _shortened(path, free, rng)
+        for step in (EDGE, FINE) if ends else ():  # finer, where something was passed between two looks
+            path = _straight(site, ends, free, step)
+            if path is None and share in LOOKS:
+                path = _through(site, ends, free, rng, step, LOOKS[share] * checks * (1 if step == EDGE else 2))
+            elif path is None and step == EDGE:
+                path = _searched(site, ends, free, seed, partial(_spent, free, checks, end))
+            if path is None:
+                break
+            path = _shortened(path, free, rng, step)
             if free.along(path, FINE, BETWEEN):
                 return path
         if time.monotonic() > end:
             raise PlanError(f"plan: no path to {_text(goal)} found in {within:g} s")
-    raise PlanError(why or f"plan: no path to {_text(goal)} found in {HARDER * checks} edges")
+    raise PlanError(why or f"plan: no path to {_text(goal)} found in {LOOKS[0.0] * checks} postures")
 
 
 def sub_goals(robot: Robot, path: F64, goal: Goal) -> list[Goal]:
@@ -149,14 +160,24 @@ class _Free:
 # -- the search ----------------------------------------------------------------------------------------------------
 
 
+def _straight(site: Site, ends: list[F64], free: _Free, step: float) -> F64 | None:
+    """Return the first straight edge (2, n) to an end that is free."""
+    return next((edge for q in ends if free.along(edge := np.array([site.start, q]), step)), None)
+
+
+def _through(site: Site, ends: list[F64], free: _Free, rng: np.random.Generator, step: float, looks: int) -> F64 | None:
+    """Return a path (k, n) that the compiled search finds within so many postures looked at, a step [rad] apart."""
+    roots, n = np.array([site.start, *ends]), site.robot.n
+    around = np.resize(np.repeat(AROUND, 2), looks // 4)[:, None]  # each tree grows towards samples of each
+    low, high = np.maximum(free.low, roots.min(axis=0) - around), np.minimum(free.high, roots.max(axis=0) + around)
+    samples = low + rng.random((len(around), n)) * (high - low)
+    counts, reach = np.array([0, looks]), round(REACH / step)
+    path = connected(free.body, roots, samples, site.obstacles, free.room, step, reach, counts)
+    return path if len(path) else None
+
+
 def _searched(site: Site, ends: list[F64], free: _Free, seed: int, stop: Callable[[], bool]) -> F64 | None:
-    """Return a path (k, n): a straight edge where one is free, else RRT-Connect's; None when that is stopped first."""
-    for q in ends:
-        edge = np.array([site.start, q])
-        if free.along(edge, EDGE):
-            return edge
-    if not ends:
-        return None
+    """Return a path (k, n) of OMPL's RRT-Connect, None when that is stopped first."""
     util.RNG.setSeed(seed + 1)  # before anything that draws is made
     n = site.robot.n
     space = _space(free)
@@ -220,16 +241,16 @@ def _state(space: base.RealVectorStateSpace, q: F64) -> base.State:
     return state
 
 
-def _shortened(path: F64, free: _Free, rng: np.random.Generator, tries: int = 150) -> F64:
+def _shortened(path: F64, free: _Free, rng: np.random.Generator, step: float, tries: int = 150) -> F64:
     """Return the path with random shortcuts taken where they are free."""
     for _ in range(tries):
-        fine = _resampled(path, EDGE * 2.0)
+        fine = _resampled(path, 2.0 * EDGE)
         if len(fine) < 3:
             break
         a, b = sorted(rng.integers(0, len(fine), 2).tolist())
         if b - a < 2:
             continue
-        if free.all(along(fine[a], fine[b], EDGE)):
+        if free.all(along(fine[a], fine[b], step)):
             path = np.concatenate([fine[: a + 1], fine[b:]])
     return path
 
