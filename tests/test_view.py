@@ -24,6 +24,7 @@ from rtctl.log.record.recorder import blob_of
 from rtctl.log.record.requests import encode_event, encode_request
 from rtctl.log.record.ring import attach, create
 from rtctl.log.record.scene import Scene
+from rtctl.log.record.surroundings import Thing
 from rtctl.log.record.tap import Tap
 from rtctl.types import F64, ObstacleEdit, Request, Shape, State, Status, Verb
 from rtctl.view import gate as gates
@@ -35,7 +36,7 @@ from rtctl.view.moment import STATES, STATUSES, Reader, scan_of
 from rtctl.view.operator import LOCKED, Operator
 from rtctl.view.page import Page
 from rtctl.view.shapes import triangles
-from rtctl.view.words import bars_html, chart_data, state_html
+from rtctl.view.words import AMBER, GREEN, RED, bars_html, chart_data, state_html
 from rtctl.world.primitives import distance
 from tests.lab import ROOT
 from tests.test_console import BOUNDS, PERIOD
@@ -189,9 +190,26 @@ def test_texts_of_a_log_are_no_markup(record: Recorded) -> None:
     assert m is not None
     evil = "<script>alert(1)</script>"
     page = state_html(m._replace(state=evil, faults=((evil, evil),), status="limited"), evil, evil)
-    page += bars_html(m._replace(clearances=((evil, 0.01),)), record.story.reader)
+    page += bars_html(m._replace(clearances=((evil, 0.01),)), record.story.reader, {})
     assert "<script" not in page
     assert "&lt;script" in page
+
+
+def test_a_bar_has_the_colour_of_the_obstacles_own_numbers(record: Recorded) -> None:
+    """0.06 m: within the config's 0.1 m, beyond an influence of its own of 0.05 m, below a clearance of 0.07 m."""
+    record.seek(1.2)
+    record.step()
+    story = record.story
+    m = story.moment
+    assert m is not None
+    for numbers, colour in (
+        ({}, AMBER),
+        ({"influence": 0.05, "clearance": 0.01}, GREEN),
+        ({"influence": 0.2, "clearance": 0.07}, RED),
+    ):
+        ball = Thing({"type": "sphere", **numbers}, 0.0, np.zeros((0, 6)))
+        page = bars_html(m._replace(clearances=(("ball", 0.06),), torques=()), story.reader, {"ball": (ball, False)})
+        assert [c for c in (AMBER, GREEN, RED) if c in page] == [colour]
 
 
 def test_charts_have_as_many_values_as_times(record: Recorded) -> None:

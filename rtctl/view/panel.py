@@ -225,7 +225,7 @@ class Panel:
             self.put("_state", note_html(remark or "Waiting for the first tick.", AMBER))
             return
         self.put("_state", state_html(m, story.detail, remark))
-        self.put("_bars", bars_html(m, self.reader))
+        self.put("_bars", bars_html(m, self.reader, story.things))
         self.put("_events", events_html(story.said))
         if self.record is not None:
             self._slider.value = round(float(self.record.at), 2)  # type: ignore[misc]

@@ -1,10 +1,11 @@
 """What a panel says, as HTML: state, diagnosis, faults, bars, events; and the numbers of its charts."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rtctl.log.record.surroundings import Thing
 from rtctl.types import F64
 from rtctl.view.follow import Sample
 from rtctl.view.moment import Moment, Reader, length
@@ -35,13 +36,15 @@ def state_html(m: Moment, detail: str, remark: str) -> str:
     return f'<div style="{STYLE}; padding-bottom:6px">{"".join(lines)}</div>'
 
 
-def bars_html(m: Moment, reader: Reader) -> str:
-    """Return clearances by obstacle and torques by joint as bars."""
-    full, near = 2.0 * reader.influence, max(reader.clearance, 1e-3)
+def bars_html(m: Moment, reader: Reader, things: Mapping[str, tuple[Thing, bool]]) -> str:
+    """Return clearances by obstacle and torques by joint as bars; things: `Story.things`."""
     rows = []
     for name, d in m.clearances[:FEW]:
-        colour = RED if d < near else AMBER if d < reader.influence else GREEN
-        rows.append(_bar(name, d / full, length(d), colour))
+        own = things[name][0].shape if name in things else {}
+        influence = float(own.get("influence") or reader.influence)
+        clearance = max(float(own.get("clearance") or reader.clearance), 1e-3)
+        colour = RED if d < clearance else AMBER if d < influence else GREEN
+        rows.append(_bar(name, d / (2.0 * influence), length(d), colour))
     if not m.clearances:
         rows.append(f"<div style='color:{GREY}'>No obstacle near.</div>")
     if m.torques:
