@@ -389,3 +389,27 @@ def test_a_description_without_a_drives_fault_is_that_of_the_table():
         assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP) == TABLE.describe(BIT[name], State.SAFE_STOP)
         assert describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP).startswith(f"SAFE_STOP: {name}: ")
     assert describe(0, nothing, ("a", "b"), State.RUN) == "RUN"
+
+
+@pytest.mark.parametrize("active", [True, False])
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (0, set()),
+        (detection.TOUCHED, {"collision"}),
+        (detection.STRUCK, {"collision_hard"}),
+        (detection.TOUCHED | detection.STRUCK, {"collision_hard"}),
+    ],
+)
+def test_what_touches_an_arm_that_is_driven_is_one_fault_of_the_two(flags: int, told: set[str], active: bool):
+    assert found(flags=flags, active=active) == (told if active else set())
+    beside = found(flags=flags | detection.FAULT, active=active)
+    assert beside == {"drive_fault"} | (told if active else set())
+
+
+def test_a_collision_is_told_with_its_link_where_it_is_known():
+    nothing = feedback([1, 0xD])
+    for name in ("collision", "collision_hard"):
+        for link in ("", "link4"):
+            told = describe(BIT[name], nothing, ("a", "b"), State.SAFE_STOP, link)
+            assert told == TABLE.describe(BIT[name], State.SAFE_STOP) + (f" at {link}" if link else "")
