@@ -1,10 +1,17 @@
-"""pybullet without its chatter on stdout and stderr, which belong to machine-readable output."""
+"""pybullet without its chatter on stdout and stderr, which belong to machine-readable output.
+
+Where it is not installed, as on Pythons that it has no wheel for, `stand_in` answers for it: then MuJoCo moves the arm.
+"""
 
 import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
 
+IS_THERE = find_spec("pybullet") is not None or find_spec("mujoco") is None  # without both, pybullet is what lacks
 _libc = ctypes.CDLL(None)
 
 
@@ -27,6 +34,6 @@ def silent() -> Iterator[None]:
 
 
 with silent():
-    import pybullet as pb
+    pb: ModuleType = import_module("pybullet" if IS_THERE else "firmware_sim.stand_in")
 
-__all__ = ["pb", "silent"]
+__all__ = ["IS_THERE", "pb", "silent"]

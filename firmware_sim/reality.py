@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from firmware_sim.bullet import IS_THERE
 from firmware_sim.settings import Settings, SettingsError
 
 ENGINES = ("bullet", "mujoco")
@@ -54,9 +55,11 @@ def reality_of(table: dict[str, Any], settings: Settings) -> Reality:
     if unknown:
         raise SettingsError(f"plant.{unknown[0]}: unknown, wanted one of {', '.join(KEYS)}")
     n = len(settings.joints)
-    engine, model = _text(table, "engine") or ENGINES[0], _text(table, "model")
+    engine, model = _text(table, "engine") or ENGINES[0 if IS_THERE else 1], _text(table, "model")
     if engine not in ENGINES:
         raise SettingsError(f"plant.engine: got {engine!r}, wanted one of {', '.join(ENGINES)}")
+    if engine == "bullet" and not IS_THERE:
+        raise SettingsError('plant.engine: got "bullet", but pybullet is not installed; wanted "mujoco"')
     if model and engine != "mujoco":
         raise SettingsError(f'plant.model: an MJCF needs engine = "mujoco", which is "{engine}"')
     coulomb = _each(table, "coulomb_Nm", n, [j.coulomb for j in settings.joints], _within(0.0, 1000.0))

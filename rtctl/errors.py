@@ -68,6 +68,7 @@ class PlanError(RtctlError):
 
 
 EXTRAS = {  # modules that the core does without, and the extra of the package that brings each
+    "mujoco": "sim",
     "pybullet": "sim",
     "pybullet_data": "sim",
     "ompl": "plan",
@@ -90,7 +91,7 @@ def lacking(error: ModuleNotFoundError) -> str:
     extra = EXTRAS.get(module)
     if extra is None:
         return ""
-    more = NO_BULLET if extra == "sim" and sys.version_info >= (3, 12) else ""
+    more = NO_BULLET if module.startswith("pybullet") and sys.version_info >= (3, 12) else ""
     return f"{module} is not installed: this needs rtctl[{extra}]: pip install 'rtctl[{extra}]'{more}"
 
 

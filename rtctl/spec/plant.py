@@ -71,7 +71,13 @@ class PlantTable(Table, frozen=True, kw_only=True):
     gripper_thing: Annotated[
         float, Meta(ge=0.0, le=2.0, description="share of its way at which a gripper meets a thing; above 1: nothing")
     ] = 2.0
-    engine: Annotated[Literal["bullet", "mujoco"], Meta(description="what moves the arm")] = "bullet"
+    engine: (
+        Annotated[
+            Literal["bullet", "mujoco"],
+            Meta(description="what moves the arm; default: bullet, mujoco where pybullet is not installed"),
+        ]
+        | None
+    ) = None
     model: (
         Annotated[
             Text,
