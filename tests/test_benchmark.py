@@ -45,7 +45,9 @@ def test_the_goal_is_the_tips_pose_and_what_is_grasped_is_left_out(tmp_path: Pat
     file = data(tmp_path, [box("grasped", tip.x.tolist(), 0.04), box("shelf", [0.9, 0.9, 0.9], 0.1)])
     problems.cache_clear()
     cases = list(source.cases(Asked((), range(1), 1, {"data": str(file), "per-set": "2", "plan": "never"})))
-    assert len(cases) == 2
+    assert [case.number for case in cases] == [0, 1]
+    others = source.cases(Asked((), range(1), 1, {"data": str(file), "per-set": "1", "skip": "2", "plan": "never"}))
+    assert [case.number for case in others] == [2]
     table = source.scene(cases[0]).table
     assert table["start_q_rad"] == HOME
     assert table["goal"][0]["position_m"] == pytest.approx(tip.x, abs=1e-9)

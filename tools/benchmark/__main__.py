@@ -44,12 +44,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--data", metavar="FILE[,FILE]", required=True, help="problems, see docs/benchmark.md")
     parser.add_argument("--per-set", metavar="N", type=int, default=0, help="problems of each set; default: all")
+    parser.add_argument("--skip", metavar="N", type=int, default=0, help="problems of each set left out before them")
     parser.add_argument("--plan", choices=("auto", "never"), default="auto", help="with the planner, or reactive alone")
     parser.add_argument("--out", metavar="DIR", default="", help="default: out/benchmark_PLAN_N")
     args, rest = parser.parse_known_args(argv)  # the rest is of `rtctl campaign run`
-    out = args.out or f"out/benchmark_{args.plan}_{args.per_set or 'all'}"
+    out = args.out or f"out/benchmark_{args.plan}_{args.per_set or 'all'}_after_{args.skip}"
     files = ",".join(str(Path(file).resolve()) for file in args.data.split(","))
-    options = [f"data={files}", f"plan={args.plan}", f"per-set={args.per_set}"]
+    options = [f"data={files}", f"plan={args.plan}", f"per-set={args.per_set}", f"skip={args.skip}"]
     words = [word for option in options for word in ("--option", option)]
     code = rtctl(["campaign", "run", "tools.benchmark.source", "--out", out, *words, *rest])
     print(published())

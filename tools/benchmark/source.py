@@ -46,12 +46,13 @@ FRAMES = {"panda": "panda_link0", "ur5": "base_link"}  # that the obstacles are 
 
 
 class Benchmark:
-    """`data`: files, comma-separated; `per-set`: problems of each, default all; `plan`: auto or never."""
+    """`data`: files, comma-separated; `per-set` of each, default all, after `skip` others; `plan`: auto or never."""
 
     def cases(self, asked: Asked) -> Iterator[Case]:
         """Yield a case for each problem."""
-        options = options_within(asked, ("data", "per-set", "plan"), "tools.benchmark.source")
+        options = options_within(asked, ("data", "per-set", "skip", "plan"), "tools.benchmark.source")
         per_set = int(options.get("per-set", 0)) or 1_000_000
+        skip = int(options.get("skip", 0))
         plan = options.get("plan", "auto")
         if plan not in ("auto", "never"):
             raise UsageError(f"benchmark: plan: got {plan}, wanted auto or never")
@@ -67,7 +68,7 @@ class Benchmark:
             taken: Counter[str] = Counter()
             for number, problem in enumerate(data["problems"]):
                 taken[problem["set"]] += 1
-                if taken[problem["set"]] <= per_set:
+                if skip < taken[problem["set"]] <= skip + per_set:
                     body = json.dumps({"problem": problem, "plan": plan})
                     yield Case("tools.benchmark.source", name, text, 0, number, problem["set"], body=body)
 
