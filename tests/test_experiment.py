@@ -182,6 +182,12 @@ def test_the_arm_yields_to_a_ball_and_comes_back():
     drawn(moving, data)
 
 
+def test_a_slow_loop_takes_its_own_lateness_for_no_load():
+    """At 100 Hz the model is 20 ms behind a fast wrist: a load was noticed that is not there, then `innovation`."""
+    run = rates._played(rates.config_file("panda"), 100, 100, True, lambda part: None)
+    assert (run.arrived, run.contacts, run.faults) == (True, 0, ())
+
+
 def test_the_papers_rates_work_and_the_estimator_is_worth_its_name():
     data = rates.run(pairs=((225, 100),))
     carried, held = rates.figures(data)["runs"]

@@ -48,6 +48,7 @@ from rtctl.world.primitives import distance
 
 POSTURES = 256  # sampled for torque and inertia extremes
 NOTICEABLE = 0.002  # of the rating: an external torque that is less is what rounding of torques leaves
+PROMPT = 0.01  # [s] of servo and model period together: up to there, what a model is behind is less than that rounding
 FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
 VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may disagree
 OWN_RATE = 150.0  # [1/s] of the drives' own position loops at most: they turn at 10 kHz or more, the virtual ones at 2
@@ -121,7 +122,7 @@ def build(config: Config, path: str | Path) -> Robot:
         grippers=tuple(map(gripper_of, config.gripper)),
         payload_max=config.robot.payload_max_kg,
         friction_max=config.safety.friction_ratio * tau_rated,
-        noticeable=NOTICEABLE * tau_rated,
+        noticeable=NOTICEABLE * tau_rated * _behind(config.loop.servo_hz, config.loop.model_hz),
         viscous=np.array([j.friction_Nms_rad + j.friction.viscous_Nms_rad for j in joints]),
         viscous_told=np.array([j.friction.viscous_Nms_rad for j in joints]),
         coulomb=np.array([j.friction.coulomb_Nm for j in joints]),
@@ -201,6 +202,14 @@ def tool_of(config: Config) -> Load:
         return NOTHING
     xx, xy, xz, yy, yz, zz = tool.inertia_kg_m2 or (0.0,) * 6
     return Load(tool.mass_kg, np.array(tool.com_m), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+
+
+def _behind(servo_hz: float, model_hz: float) -> float:
+    """Return by how much more the torque of a load seems to be another because the model of a moving arm is old.
+
+    It is carried along, and what is left grows as the square of its age.
+    """
+    return max(1.0, ((1.0 / servo_hz + 1.0 / model_hz) / PROMPT) ** 2)
 
 
 def rigid_body(config: Config, path: Path) -> RigidBody:
