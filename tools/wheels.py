@@ -86,7 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             begun = time.monotonic()
             why = tried(python, wheel, folder, (*FIRST, *((DEMO,) if arguments.sim else ())))
             tested, failed = tested + 1, failed + bool(why)
-            print(f"{version}: {why or 'installed, imported, init, check, log info'}", end="", flush=True)
+            fine = "installed, imported, init, check, log info" + (", demo" if arguments.sim else "")
+            print(f"{version}: {why or fine}", end="", flush=True)
             print(f", {time.monotonic() - begun:.0f} s", flush=True)
     return 1 if failed or not tested else 0
 
