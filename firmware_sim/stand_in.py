@@ -374,9 +374,13 @@ def _loaded(name: str, scale: Three) -> coal.BVHModelBase:
 
 
 def createMultiBody(
-    mass: float, shape: int, visual: int = -1, position: Three = (0.0, 0.0, 0.0), xyzw: Three = (0.0, 0.0, 0.0, 1.0),
+    mass: float,
+    shape: int,
+    visual: int = -1,
+    position: Three = (0.0, 0.0, 0.0),
+    xyzw: Three = (0.0, 0.0, 0.0, 1.0),
     physicsClientId: int = 0,
-) -> int:  # fmt: skip
+) -> int:
     world = _worlds[physicsClientId]
     number = next(world.numbers)
     world.bodies[number] = _Body([world.shapes[shape]])
@@ -446,9 +450,14 @@ def _nearest(one: _Body, other: _Body, sight: float, names: tuple[int, int, int,
 
 
 def calculateJacobian(
-    body: int, link: int, local: Three, q: Sequence[float], qd: Sequence[float], qdd: Sequence[float],
+    body: int,
+    link: int,
+    local: Three,
+    q: Sequence[float],
+    qd: Sequence[float],
+    qdd: Sequence[float],
     physicsClientId: int = 0,
-) -> tuple[F64, F64]:  # fmt: skip
+) -> tuple[F64, F64]:
     arm = _arm(physicsClientId)
     return arm.jacobian(link, local, dict(zip(sorted(arm.q), q, strict=True)))
 
