@@ -37,7 +37,7 @@ CAPACITY = 32 << 20  # [bytes]: some 8 s of a 7-joint arm at 1 kHz
 PREFIX = "rtctl-"
 SUFFIX = ".ring"
 NAP = 0.02  # [s] between looks at the ring
-READY_TIMEOUT = 20.0  # [s]
+READY_TIMEOUT = 60.0  # [s] a process that lives may take that long to come up on a machine that is busy
 LONGEST = 7 * 86400.0  # [s] of a segment
 LARGEST = 10**13  # [bytes] of a segment and of the free disk that is kept, as a config may say
 
