@@ -273,6 +273,17 @@ def test_a_file_that_is_damaged_is_made_anew(tmp_path: Path, damage: str) -> Non
     assert kept.read(path) is not None
 
 
+def test_a_file_of_which_one_digit_is_another_is_made_anew(tmp_path: Path) -> None:
+    """A sphere that is a little smaller reads as well as the true one, and protects less."""
+    body = crooked(tmp_path)
+    made = place(body, 0.04)
+    (path,) = (tmp_path / "points").iterdir()
+    text = path.read_text()
+    first = text.index('"radius": [0.') + len('"radius": [0.')
+    path.write_text(text[:first] + "0" + text[first:])  # a tenth
+    assert same(place(body, 0.04), made)
+
+
 def test_where_nothing_can_be_written_spheres_are_placed_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,9 +28,12 @@ def place_of(solids: Sequence[Solid], overhang: float, module: str, file: str) -
 
 
 def read(path: Path) -> tuple[Points, Coverage] | None:
-    """Return what a file keeps; None where there is none, or it is damaged."""
+    """Return what a file keeps; None where there is none, or a bit of it is another: these spheres protect the arm."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        said = json.loads(path.read_bytes())
+        total, _, text = path.read_bytes().partition(b"\n")
+        if total.decode() != hashlib.sha256(text).hexdigest():
+            return None
+        said = json.loads(text)
         points = Points(
             np.array(said["link"], np.int64),
             np.array(said["local"], np.float64),
@@ -58,8 +61,9 @@ def write(path: Path, points: Points, found: Coverage) -> None:
     with suppress(OSError):
         path.parent.mkdir(mode=0o700, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent)
-        with open(handle, "w") as out:
-            json.dump(said, out)
+        text = json.dumps(said).encode()
+        with open(handle, "wb") as out:
+            out.write(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
         os.replace(name, path)
         for old in sorted(path.parent.iterdir(), key=lambda entry: entry.stat().st_mtime)[:-KEPT]:
             old.unlink(missing_ok=True)
