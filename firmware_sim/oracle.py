@@ -122,11 +122,8 @@ class Oracle:
         """Return the contact: whose surface moved faster along the normal before they met closed the gap."""
         arm = self.arm
         q, qd = before.q, before.qd  # the impact has changed the arm's speed already
-        com, turned = pb.getLinkState(arm.body, point[3], physicsClientId=arm.client)[:2]
-        local, _ = pb.multiplyTransforms(*pb.invertTransform(com, turned), point[5], (0.0, 0.0, 0.0, 1.0))
-        rows = pb.calculateJacobian(arm.body, point[3], local, q, qd, [0.0] * len(q), physicsClientId=arm.client)
         normal = np.array(point[7])  # from the obstacle to the arm
-        row = normal @ np.array(rows[0])
+        row = normal @ jacobian(arm, point[3], point[5], q)
         own = -float(row @ np.array(qd))
         shape = shape_at(self._solid(name), now.scene_ns / NS)
         other = 0.0
@@ -236,6 +233,17 @@ def _least(points: Sequence[tuple[Any, ...]], otherwise: float) -> float:
     if len(points) == 1:
         return float(points[0][8])
     return min((p[8] for p in points), default=otherwise)
+
+
+def jacobian(arm: Arm, link: int, place: Sequence[float] | F64, q: Sequence[float]) -> F64:
+    """Return how a place [m] of a link, in the world, moves with the joints, (3, n) [m/rad].
+
+    pybullet wants it from the link's own origin, but along the axes of the link's inertia.
+    """
+    state = pb.getLinkState(arm.body, link, physicsClientId=arm.client)
+    local, _ = pb.multiplyTransforms(*pb.invertTransform(state[4], state[1]), place, (0.0, 0.0, 0.0, 1.0))
+    rest = [0.0] * len(q)
+    return np.array(pb.calculateJacobian(arm.body, link, local, list(q), rest, rest, physicsClientId=arm.client)[0])
 
 
 def reach_of(arm: Arm, link: int) -> F64:

@@ -105,6 +105,36 @@ def test_it_measures_what_pybullet_measures(name: str, monkeypatch: pytest.Monke
     assert compared > 20
 
 
+@pytest.mark.parametrize("here", [pybullet, stand_in])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_place_of_a_link_moves_as_finite_differences_say(
+    name: str, here: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, place, step = settings_of(name), np.array([0.3, 0.5, 0.7]), 3e-3
+    for q in postures(settings, 2):
+        world = standing(settings, q, here, monkeypatch)
+        for link in world.links:
+            R, t = frame(here, world, link)
+            local = R.T @ (place - t)
+            columns = []
+            for j in range(len(q)):
+                ends = []
+                for way in (step, -step):
+                    world.place(q + way * np.eye(len(q))[j])
+                    R, t = frame(here, world, link)
+                    ends.append(R @ local + t)
+                columns.append((ends[0] - ends[1]) / (2.0 * step))
+            world.place(q)
+            found = oracle.jacobian(world.oracle.arm, link, place, q.tolist())
+            assert np.allclose(found, np.array(columns).T, atol=2e-4), world.links[link]  # states are single floats
+        world.close()
+
+
+def frame(here: ModuleType, world: SecondPlant, link: int) -> tuple[F64, F64]:
+    place, turned = here.getLinkState(world.body, link, 1, 1, world.client)[4:6]
+    return np.array(pybullet.getMatrixFromQuaternion(turned)).reshape(3, 3), np.array(place)
+
+
 def test_a_contact_has_the_link_and_the_speeds_that_pybullet_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     """The arm falls onto a ball that comes up to it."""
     settings = settings_of("planar4")
