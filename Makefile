@@ -23,6 +23,9 @@ WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
 WORKERS ?= 2
 
+# A program's bytecode is kept when it first runs; without that each start translates all of the sources anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DELETE_ON_ERROR:
 .PHONY: demo demo-rover test lint bench benchmark stress mutants docs pictures wheels fuzz ordeal soak install lock clean
 
@@ -78,7 +81,7 @@ install: $(INSTALLED) $(SYSTEM) $(WARM)
 $(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "rtctl needs Python 3.11 or newer: make PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 

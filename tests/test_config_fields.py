@@ -6,7 +6,7 @@ without bounds fails.
 
 import difflib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +28,19 @@ KINDS: tuple[tuple[str, Any, Load], ...] = (
 )
 
 
-def around(kind: Any, leaf: Leaf) -> dict[str, Any]:
-    """Return a document with every required table and the one that holds the leaf."""
+def cases(name: str, kind: Any, load: Load) -> Iterator[Any]:
+    """Yield each leaf with a document that has every required table and the one that holds the leaf."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     full = specimen(info)
-    wanted = {f.encode_name for f in info.fields if f.required} | set(leaf.path[:1])
-    return {key: value for key, value in full.items() if key in wanted}
+    required = {f.encode_name for f in info.fields if f.required}
+    for leaf in leaves(info, full):
+        wanted = required | set(leaf.path[:1])
+        document = {key: value for key, value in full.items() if key in wanted}
+        yield pytest.param(load, document, leaf, id=f"{name}:{dotted(leaf.path) or 'file'}")
 
 
-CASES = [
-    pytest.param(load, around(kind, leaf), leaf, id=f"{name}:{dotted(leaf.path) or 'file'}")
-    for name, kind, load in KINDS
-    for leaf in leaves(inspect.type_info(kind), specimen(inspect.type_info(kind)))
-]
+CASES = [case for each in KINDS for case in cases(*each)]
 
 
 def refusal(load: Load, path: Path, document: dict[str, Any]) -> ConfigError:
