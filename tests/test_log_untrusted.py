@@ -15,6 +15,8 @@ import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 from mcap.reader import make_reader
+from mcap.records import Message, MessageIndex
+from mcap.stream_reader import StreamReader
 
 from rtctl.errors import EXIT_FAILED, LogError
 from rtctl.log import Kind, McapSink, limits, make_header, read
@@ -247,6 +249,21 @@ def test_recovery_leaves_nothing_behind_when_it_fails(tmp_path: Path, monkeypatc
             mend(path)
         assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
     assert path.read_bytes() == before
+
+
+def test_the_index_of_a_copy_says_the_times_of_its_messages_whatever_they_are(tmp_path: Path):
+    """As another program finds them: no integer of 64 bits may go through a float, or be cut to a signed one."""
+    first, second = (message(k, (1 << 63) + 12345 + k) for k in range(2))
+    path = file_of(
+        tmp_path / "a.mcap", chunk_of(first + second, zstd(first) + zstd(second)), topics=("/x", "/log/sentinel")
+    )
+    path.write_bytes(path.read_bytes()[:-40])  # cut off: the copy is given a sentinel
+    copy = mend(path).path.read_bytes()
+    said = [r for r in StreamReader(io.BytesIO(copy), emit_chunks=True).records if isinstance(r, MessageIndex)]
+    held = [r for r in StreamReader(io.BytesIO(copy)).records if isinstance(r, Message)]
+    assert len(held) == 3
+    assert sorted(time for index in said for time, _ in index.records) == sorted(m.log_time for m in held)
+    assert max(m.log_time for m in held) == (1 << 63) + 12346
 
 
 def test_what_is_behind_damage_is_found_again(tmp_path: Path):

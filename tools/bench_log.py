@@ -114,8 +114,8 @@ def stretched(source: Path, target: Path, copies: int) -> float:
             data = raw.copy()
             stamps = np.repeat((rows.time + k * span)[:, None], 2, axis=1).astype("<i8").view(np.uint8)
             data[rows.offset[:, None] + TIMES_AT + np.arange(16)] = stamps
-            encoded = Encoded(data.tobytes(), rows.channel, rows.sequence, rows.time + k * span, rows.offset)
-            segment.add(encoded)
+            later = (rows.time + k * span).astype(np.uint64)
+            segment.add(Encoded(data.tobytes(), rows.channel, rows.sequence, later, rows.offset))
             segment.flush()
     segment.finish()
     return copies * span / 1e9

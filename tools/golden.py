@@ -76,7 +76,8 @@ def condensed(run: Run, path: Path) -> int:
     plain = header._replace(versions={}, revision="")  # kept in the index: the file changes with the law alone
     segment = begin(path, plain, tuple(wanted), 0, more)
     segment.compressor = zstandard.ZstdCompressor(level=LEVEL)
-    segment.add(Encoded(b"".join(pieces), number_of, sequence, time_of, np.cumsum(sizes) - sizes))
+    stamps = time_of.astype(np.uint64)
+    segment.add(Encoded(b"".join(pieces), number_of, sequence, stamps, np.cumsum(sizes) - sizes))
     segment.finish()
     return path.stat().st_size
 

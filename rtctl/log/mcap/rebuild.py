@@ -12,7 +12,7 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from rtctl.log.mcap.recovery import sentinel
-from rtctl.log.mcap.rows import Encoded
+from rtctl.log.mcap.rows import Encoded, single
 from rtctl.log.mcap.segment import CHUNK_BYTES, Chunk, Segment
 from rtctl.log.mcap.summary import END, MAGIC, packed
 from rtctl.log.mcap.walk import (
@@ -172,9 +172,7 @@ class _Copy:
         channel, sequence, time, _ = MESSAGE.unpack_from(self.data, body)
         if channel not in self._channels:
             raise Damaged("message: of no channel")
-        one = np.array([channel], np.int64), np.array([sequence], np.int64), np.array([time], np.uint64)
-        raw = bytes(self.data[body - RECORD.size : end])
-        self._add(Encoded(raw, one[0], one[1], one[2], np.zeros(1, np.int64)))  # type: ignore[arg-type]
+        self._add(single(bytes(self.data[body - RECORD.size : end]), channel, sequence, time))
 
     def _add(self, encoded: Encoded) -> None:
         self.segment.add(encoded)
@@ -221,8 +219,7 @@ class _Copy:
         for k in rows.tolist():
             at = int(found.offset[k])
             raw = content[at : at + RECORD.size + MESSAGE.size + int(found.size[k])]
-            row = slice(k, k + 1)
-            self._add(Encoded(raw, found.channel[row], found.sequence[row], found.stamp[row], np.zeros(1, np.int64)))  # type: ignore[arg-type]
+            self._add(single(raw, int(found.channel[k]), int(found.sequence[k]), int(found.stamp[k])))
 
     def _attachment(self, body: int, end: int) -> None:
         found = parsed(records.Attachment.read, self.data, body, end)

@@ -13,11 +13,10 @@ from rtctl.errors import LogError
 from rtctl.log import schema
 from rtctl.log.mcap.catalog import attachment, catalog
 from rtctl.log.mcap.names import OPEN, logs_in
-from rtctl.log.mcap.rows import Encoded, message
+from rtctl.log.mcap.rows import Encoded, message, nothing, single
 from rtctl.log.mcap.segment import Segment, locked, settle
 from rtctl.log.mcap.summary import END, Summary, message_indices
 from rtctl.log.mcap.walk import (
-    I64_MAX,
     MESSAGE,
     RECORD,
     Damaged,
@@ -132,10 +131,8 @@ def sentinel(summary: Summary, content: Json) -> Encoded:
         if channel.topic == schema.SENTINEL:
             sequence = summary.last.get(channel.id, 0) + 1
             data = message(channel.id, sequence, summary.end, json.dumps(content).encode())
-            time = min(summary.end, I64_MAX)
-            return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel.id, sequence, time, 0)))
-    none = np.zeros(0, dtype=np.int64)
-    return Encoded(b"", none, none, none, none)
+            return single(data, channel.id, sequence, summary.end)
+    return nothing()
 
 
 def _scan(data: bytes) -> _Scan:

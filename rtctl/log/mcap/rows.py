@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rtctl.log.entry import Payload
 from rtctl.log.schema import MESSAGE, Layout
-from rtctl.types import I64, U8
+from rtctl.types import I64, U8, U64
 
 OP_MESSAGE = 5
 
@@ -19,8 +19,20 @@ class Encoded(NamedTuple):
     data: bytes
     channel: I64
     sequence: I64
-    time: I64  # log_time [ns]
+    time: U64  # log_time [ns]: all that a file may say; with signed ones beside it numpy would make floats of both
     offset: I64  # in data
+
+
+def single(data: bytes, channel: int, sequence: int, time: int) -> Encoded:
+    """Return one whole message record; time: log_time [ns]."""
+    one = np.array([channel], np.int64), np.array([sequence], np.int64), np.array([time], np.uint64)
+    return Encoded(data, *one, np.zeros(1, np.int64))
+
+
+def nothing() -> Encoded:
+    """Return no message."""
+    none = np.zeros(0, np.int64)
+    return Encoded(b"", none, none, none.astype(np.uint64), none)
 
 
 class Rows(NamedTuple):
@@ -75,7 +87,10 @@ def assembled(
     lead = b"".join(e.data for e in first)
     sizes = np.fromiter(map(len, pieces), np.int64, len(pieces))
     starts = np.cumsum(sizes) - sizes + len(lead)
-    channel, time, sequence, offset = ([] for _ in range(4))  # type: tuple[list[I64], list[I64], list[I64], list[I64]]
+    channel: list[I64] = []
+    time: list[U64] = []
+    sequence: list[I64] = []
+    offset: list[I64] = []
     at = 0
     behind = len(lead) + int(sizes.sum())
     for k, e in enumerate([*first, *last]):
@@ -88,12 +103,11 @@ def assembled(
         at += len(e.data)
     for rows, number, stamp, counted, within in columns:
         channel.append(np.full(len(rows), number, dtype=np.int64))
-        time.append(stamp)
+        time.append(stamp.astype(np.uint64))
         sequence.append(counted)
         offset.append(starts[rows] + within)
     if not channel:
-        none = np.zeros(0, dtype=np.int64)
-        return Encoded(b"", none, none, none, none)
+        return nothing()
     offsets = np.concatenate(offset)
     order = np.argsort(offsets, kind="stable")
     return Encoded(

@@ -62,7 +62,9 @@ class ChunkReader:
         """Yield what `work` makes of a channel's messages, chunk by chunk; chunks are unpacked by several threads."""
         chunks = self.catalog.chunks
         indices = chunks.indices(channel)
-        chosen = (chunks.end_time >= start) & (chunks.start_time < stop) & (indices >= 0)
+        chosen = (chunks.end_time >= start) & (indices >= 0)
+        if stop < I64_MAX:  # otherwise to the end, whatever times there are
+            chosen &= chunks.start_time < stop
         numbers = np.arange(len(chosen))[among]
         wanted = numbers[chosen[among]].tolist()
 

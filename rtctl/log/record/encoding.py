@@ -9,7 +9,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from rtctl.log import schema
 from rtctl.log.entry import Batch, Kind, Payload
 from rtctl.log.header import Header
-from rtctl.log.mcap.rows import Encoded, Rows, assembled, copies, message, rows_for, stamped
+from rtctl.log.mcap.rows import Encoded, Rows, assembled, copies, message, rows_for, single, stamped
 from rtctl.log.record.rover_scene import BaseScene
 from rtctl.log.record.scene import Scene
 from rtctl.log.record.surroundings import HZ, Drawing
@@ -139,7 +139,7 @@ class Encoder:
         channel = self._id[topic]
         sequence = self._own[channel] = self._own.get(channel, 0) + 1
         data = message(channel, sequence, time + self.offset, content)
-        return Encoded(data, *(np.array([x], dtype=np.int64) for x in (channel, sequence, time + self.offset, 0)))
+        return single(data, channel, sequence, time + self.offset)
 
     def _groups(self, batch: Batch) -> dict[tuple[int, int, int], list[int]]:
         """Return the entries' indices by what can be encoded in one go: kind, payload size and data size."""

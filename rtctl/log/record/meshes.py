@@ -67,7 +67,7 @@ def unpacked(urdf: str, config: str, files: Mapping[str, str | bytes], folder: P
         KeyError,
         AttributeError,
         EOFError,
-        NotImplementedError,
+        NotImplementedError,  # zipfile's, for a compression or an encryption that it does not know
         zlib.error,
         RuntimeError,
     ) as error:
