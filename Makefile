@@ -21,7 +21,7 @@ INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system
 WARM := $(VENV)/.warm
 PYTEST_FLAGS ?=
-WORKERS ?= 2
+WORKERS ?= 3
 
 # A program's bytecode is kept when it first runs; without that each start translates all of the sources anew.
 unexport PYTHONDONTWRITEBYTECODE

@@ -53,7 +53,7 @@ def await_(what: Callable[[], bool], process: "subprocess.Popen[bytes]") -> None
 
 def test_two_workers_of_which_one_is_killed_give_what_one_process_gives(tmp_path: Path):
     here, there = tmp_path / "here", tmp_path / "there"
-    count = 2
+    count = 3
     assert main(command(here, tmp_path / "a", "--workers", "0", count=count)) == 0
     assert main(command(there, tmp_path / "b", "--workers", "2", "--option", "kill=1", count=count)) == 0
     one, two = rows(here), rows(there)
