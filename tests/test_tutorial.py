@@ -1,6 +1,6 @@
 """What a newcomer types (`python -m tools.tutorial`) is what stands in the tutorial."""
 
-from tools.tutorial import PAGE, ready_word, steps
+from tools.tutorial import PAGE, lockstep, ready_word, steps
 
 TEXT = """# Title
 
@@ -46,3 +46,14 @@ def test_commands_that_do_not_end_are_told_from_others():
         ["rtctl", "sim"],
     ]
     assert found[-1][0] == "rtctl init my_arm.urdf"
+
+
+def test_on_a_busy_machine_drives_and_daemon_are_started_in_lockstep():
+    commands = next(step.commands for step in steps(PAGE.read_text(encoding="utf-8")) if "real robot" in step.title)
+    assert [lockstep(command) for command in commands[:3]] == [
+        "python -m firmware_sim configs/panda.toml --lockstep",
+        "rtctl run configs/panda.toml --lockstep",
+        "rtctl view",
+    ]
+    assert [lockstep(command) for command in commands[3:]] == commands[3:]
+    assert "`--lockstep`" in PAGE.read_text(encoding="utf-8")
