@@ -20,7 +20,7 @@ from rtctl.log import schema
 from rtctl.log.read.run import read_run
 from rtctl.types import F64, Drive, Request, State, Truth, Verb
 from tests.arms import NO_POINTS
-from tests.lab import ROOT, Lab, lab
+from tests.lab import ROOT, Lab, lab, seen, sphere
 from tests.rig import Rig
 
 OPENARM = ROOT / "configs" / "openarm.toml"
@@ -166,6 +166,23 @@ def test_it_is_lowered_until_gravity_moves_it_no_more_and_then_let_go() -> None:
         assert np.linalg.norm(here.simulator.truth().tip - lowest) < 0.1  # nothing was left to fall
         assert here.step(Request(Verb.RESET)).record["state"].item() == State.STOPPING
         here.until(State.IDLE)
+
+
+def test_it_is_not_lowered_onto_what_lies_under_it() -> None:
+    where = [0.20, -0.20, -0.37]  # under the forearm of an arm that is lowered
+    ball = {"name": "ball", "type": "sphere", "radius_m": 0.05, "position_m": where}
+    with lab(path=OPENARM, scenario={"obstacle": [ball]}, inject=("silent@0.6:0:0.05",)) as here:
+        here.running()
+        here.step(seen(sphere("ball", where, 0.05)))
+        here.ask(GOAL)
+        down = course(here, 12.0)
+        plant = here.simulator.truth()
+    assert plant.contacts == 0
+    assert plant.clearance["ball"] > 0.01  # 0.028 seen
+    assert not down.off  # it is held above it
+    assert down.largest(list(range(7)), SOON) < HELD
+    assert down.tip[0, 2] - down.tip[-1, 2] > 0.03  # it did come down
+    assert np.linalg.norm(down.tip[-1] - down.tip[down.t > down.t[-1] - 1.0][0]) < 1e-3
 
 
 def test_a_reset_before_that_goes_on_holding_it() -> None:
