@@ -1,14 +1,18 @@
 """Which goals are taken, and when one is reached."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rtctl.arm.progress import Progress, arrived, at_rest, stall_timer, time_left
+from rtctl.arm.memory import fresh, record_of
+from rtctl.arm.progress import Progress, arrived, at_rest, stall_timer, take_drift, time_left
+from rtctl.arm.target import DIAGNOSE, Target, progress_timers
 from rtctl.control.goals import refusal
-from rtctl.types import Goal, Task
+from rtctl.types import Goal, State, Task
+from tests.lab import robot
 
 FAR = np.full(3, np.inf)
 NAMES = ("", "crate", "")
@@ -109,3 +113,34 @@ def test_near_the_goal_half_of_what_is_left_is_enough():
 
 def test_who_turned_back_gains_nothing_until_it_is_nearer_than_ever():
     assert stall_timer(1.0, STUCK, 0.9, 0.5, 0.01, 2.0) == pytest.approx(1.01)
+
+
+def seconds_until_asked(velocity: Callable[[float], float]) -> float:
+    """Return when it is asked what holds an arm that goes to and fro 50 mm beside its goal, at a velocity of the time.
+
+    It is inf if that is not within 10 s.
+    """
+    arm = robot()
+    c, m = arm.constants[0], record_of(fresh())[0]
+    m.has_goal, m.state, m.nearest = 1, int(State.RUN), np.inf
+    target = Target(int(Task.POSITION), np.zeros(3), UNIT, np.zeros(3), 0.003, 0.015)
+    for k in range(round(10.0 / arm.dt)):
+        m.tick += 1
+        m.xd[1] = velocity(k * arm.dt)
+        if progress_timers(c, m, target, STUCK._replace(speed=abs(m.xd[1]))) == DIAGNOSE:
+            return k * arm.dt
+    return math.inf
+
+
+@pytest.mark.parametrize("hertz", [3.0, 5.0, 20.0])
+def test_who_trembles_is_asked_what_holds_it_as_soon_as_who_rests(hertz: float):
+    assert 1.9 < seconds_until_asked(lambda t: 0.1 * math.sin(math.tau * hertz * t)) < 2.3
+    assert seconds_until_asked(lambda t: 0.1) == math.inf  # who goes round something is not
+
+
+def test_one_tick_that_is_not_a_number_does_not_spoil_the_drift():
+    drift = np.array([0.1, 0.1, 0.1])
+    take_drift(drift, np.array([np.nan, np.inf, 0.1]), 1e-3)
+    for _ in range(2000):
+        take_drift(drift, np.array([0.3, 0.2, 0.1]), 1e-3)
+    assert drift == pytest.approx([0.3, 0.2, 0.1], abs=1e-3)

@@ -125,6 +125,7 @@ HOT = np.dtype(
             ("still", _INT),  # ticks the tip has been at rest
             ("nearest", _REAL),  # [s] at full speed: the least that the goal was away
             ("stall_timer", _REAL),  # [s] for which it has not come nearer; see `progress.stall_timer`
+            ("drift", _REAL, (3,)),  # [m/s] of the tip; see `progress.take_drift`
             # torque
             ("tau_obstacles", _REAL, _JOINT),  # [Nm] of the last tick
             ("sent", _REAL, (4, JOINTS_MAX)),  # [Nm] the last commands, newest first

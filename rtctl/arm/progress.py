@@ -1,5 +1,6 @@
 """Goals: which are taken, and when one is reached."""
 
+import math
 from typing import NamedTuple
 
 from rtctl.arm.estimator import TipEstimate
@@ -10,6 +11,7 @@ from rtctl.types import F64, Goal
 
 STILL_SPEED = 1e-2  # [m/s] and, times 4, [rad/s]: a resting tip seems this fast at most: speeds come in steps
 GAIN = 0.12  # of full speed: who comes nearer more slowly is held by something
+DRIFT_TIME = 0.2  # [s] over which the tip's velocity is averaged: who trembles at 2 Hz or more gets nowhere
 
 
 class Progress(NamedTuple):
@@ -47,6 +49,18 @@ def at_rest(p: Progress) -> bool:
 
 
 @kernel
+def take_drift(drift: F64, xd: F64, dt: float) -> None:
+    """Move drift (3,) [m/s], the tip's velocity averaged over DRIFT_TIME, on by a tick of dt [s] at xd (3,) [m/s].
+
+    A tip that is driven to and fro across a place where two links or obstacles change their nearest points is fast, but
+    its drift is not.
+    """
+    for i in range(3):
+        behind = xd[i] - drift[i]
+        drift[i] = drift[i] + behind * min(dt / DRIFT_TIME, 1.0) if math.isfinite(behind) else 0.0
+
+
+@kernel
 def slow(p: Progress) -> bool:
     """Return whether the tip goes nowhere at this speed. How fast it turns says nothing: to the goal is what counts."""
     return p.speed < 4.0 * STILL_SPEED
@@ -64,7 +78,7 @@ def stall_timer(before: float, p: Progress, left: float, nearest: float, dt: flo
 
     left [s] away now, `nearest` it ever was. At GAIN of full speed the time stands still, faster it falls; half of what
     was left in a `window` [s] is enough: the last of a way is slow. It also falls while the tip moves fast, twice as
-    quickly as it grew: who trembles gets nowhere all the same.
+    quickly as it grew. p.speed is that of the drift where this is less: who trembles gets nowhere all the same.
     """
     if not slow(p):
         return max(0.0, before - 2.0 * dt)

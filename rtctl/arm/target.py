@@ -14,7 +14,7 @@ from rtctl.arm.faults import BRAKES
 from rtctl.arm.field import APART
 from rtctl.arm.model import Model
 from rtctl.arm.osc import MotionParams
-from rtctl.arm.progress import GAIN, STILL_SPEED, Progress, arrived, at_rest, stall_timer, time_left
+from rtctl.arm.progress import GAIN, STILL_SPEED, Progress, arrived, at_rest, stall_timer, take_drift, time_left
 from rtctl.arm.stream import aim, has_velocity, stale
 from rtctl.arm.task import point_along, selected, task_error
 from rtctl.kernel import kernel
@@ -263,6 +263,7 @@ def _drags(m: RecordRow) -> bool:
 @kernel
 def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> int:
     """Advance the timers of the way to the goal; return DIAGNOSE when it is time to ask what holds the arm."""
+    take_drift(m.drift, m.xd, c.dt)
     if m.has_goal == 0 or m.state != _RUN:
         status = _FLOATING if m.floating != 0 else _NO_GOAL
         if m.status == status:
@@ -298,7 +299,8 @@ def progress_timers(c: RecordRow, m: RecordRow, target: Target, p: Progress) -> 
         return _take_status(m, _LOCAL_MINIMUM if m.still * c.dt >= c.stop_stall else _MOVING)
     before = _waited(c, m)
     left = time_left(p, c.motion_v_max, c.motion_w_max)
-    m.stall_timer = stall_timer(m.stall_timer, p, left, m.nearest, c.dt, c.stop_stall)
+    going = Progress(p.error, p.error_rot, min(p.speed, norm(m.drift)), p.rate)
+    m.stall_timer = stall_timer(m.stall_timer, going, left, m.nearest, c.dt, c.stop_stall)
     m.nearest = min(left, m.nearest)
     m.still = m.still + 1 if at_rest(p) else 0
     if c.escape != 0.0 and m.escape_phase == _NONE and m.still == int(c.escape_ticks):
