@@ -16,7 +16,7 @@ from rtctl.intake import drives
 from rtctl.intake.body import Asked, Joint
 from rtctl.intake.make import Made, make
 from rtctl.intake.shapes import CORNERS_MAX, hull
-from rtctl.intake.sources import IntakeError, Source, find, index
+from rtctl.intake.sources import IntakeError, Source, find, index, urdf_text
 
 WHOLE = Asked()
 INERTIAL = (
@@ -263,6 +263,17 @@ def test_a_robot_is_found_by_name_and_a_wrong_name_by_the_nearest() -> None:
     assert len(index()) > 50
     with pytest.raises(UsageError, match=r"ROBOT: got 'so110', wanted a file, or so1\d\d \(the nearest valid name\)"):
         find("so110")
+
+
+def test_a_xacro_whose_package_is_missing_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    arm = tmp_path / "arm.urdf.xacro"
+    arm.write_text(
+        '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:include filename="$(find no_such_support)/urdf/macro.xacro"/></robot>'
+    )
+    with pytest.raises(IntakeError) as told:
+        urdf_text(arm)
+    assert str(told.value) == "arm.urdf.xacro: got $(find no_such_support), wanted a folder of that name above the file"
 
 
 def test_the_command_writes_checks_and_says_what_comes_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,6 +127,11 @@ def urdf_text(path: Path) -> str:
     try:
         return str(xacro.process_file(str(path)).toxml())
     except Exception as error:
+        ours: BaseException | None = error
+        while ours is not None and not isinstance(ours, IntakeError):
+            ours = getattr(ours, "exc", None) or ours.__context__  # what xacro wraps, some words twice
+        if ours is not None:
+            raise ours from None
         words = re.sub(r"<class '[^']*'>: |" + re.escape(f"{path}: "), "", " ".join(str(error).split()))
         raise IntakeError(f"{path.name}: xacro: {words[:200]}") from None
     finally:
@@ -140,7 +145,7 @@ def _package(path: Path, name: str) -> Path:
             return folder / name
         if folder.name == name:
             return folder
-    raise IntakeError(f"{path}: got $(find {name}), wanted a folder of that name above the file")
+    raise IntakeError(f"{path.name}: got $(find {name}), wanted a folder of that name above the file")
 
 
 def _around(path: Path) -> list[Path]:
