@@ -170,6 +170,15 @@ def test_what_cannot_be_is_refused_or_repaired_where_that_is_asked_for(
     design.load(arm.config)
 
 
+def test_torques_that_nobody_states_brake_a_joint_that_carries_nothing(tmp_path: Path) -> None:
+    arm = made(tmp_path, chain_of(link("c")).replace('effort="60"', 'effort="0"'))  # its first axis is upright
+    joints = {j["name"]: j for j in tomllib.loads(arm.config.read_text())["robot"]["joints"]}
+    model = pin.buildModelFromUrdf(str(arm.urdf))
+    stretched = pin.crba(model, model.createData(), np.array([0.0, math.pi / 2.0, 0.0]))[0, 0]
+    assert joints["j0"]["tau_max_Nm"] >= stretched * joints["j0"]["qd_max_rad_s"] / 0.2 > 1.5
+    assert "assumed is what carries and brakes the arm: j0" in "; ".join(arm.told)
+
+
 def test_a_link_that_is_only_seen_is_given_the_hull_of_what_one_sees(tmp_path: Path) -> None:
     arm = made(tmp_path, chain_of(link("c", kind="visual")))
     assert "no collision geometry at j2: hulls of the visual meshes are taken" in arm.told

@@ -24,7 +24,8 @@ from rtctl.types import F64
 SPEED = 2.0  # [rad/s] of a joint whose description has none
 SPEED_MIN = 3.0  # [rad/s] below which a joint's own limit is left as it is
 CARRY = 1.15  # an effort that is less than this times gravity's largest torque is taken for a mistake
-SPARE = 2.5  # times gravity's largest torque: what is assumed in its place
+SPARE = 2.5  # times gravity's largest torque: what is assumed in its place, or what brakes the joint beside gravity
+BRAKING = 0.2  # [s] in which it is to be brought to rest from its speed: joint_braking_s of a config
 DENSITY = 700.0  # [kg/m3] of links whose inertia is repaired: about that of arms of aluminium and motors
 TORQUE_MAX = 2000.0  # [Nm] of a joint, as a config takes it
 POSTURES = 300
@@ -104,10 +105,11 @@ def _complete(
     arm: Arm, names: Sequence[str], told: list[str], repair: bool
 ) -> tuple[list[Joint], list[drive_table.Drive]]:
     """Return joints with nothing missing, and their drives. Raises IntakeError for torques that carry no arm."""
-    gravity = _gravity(arm)
+    gravity, inertia = _loads(arm)
     joints, mute, still = [], list[str](), list[str]()
-    for joint, load in zip(arm.joints, gravity, strict=True):
-        assumed = float(f"{max(SPARE * load, 1.0):.2g}")
+    for joint, load, mass in zip(arm.joints, gravity, inertia, strict=True):
+        brakes = mass * (SPEED if math.isnan(joint.speed) else joint.speed) / BRAKING
+        assumed = float(f"{max(SPARE * load, min(load + brakes, TORQUE_MAX), 1.0):.2g}")
         if assumed > TORQUE_MAX and not joint.effort >= CARRY * load:
             wanted = f"at most {TORQUE_MAX:g} Nm: no drive on CAN turns that"
             raise IntakeError(f"{joint.name}: got an arm of {load:.3g} Nm by gravity alone, wanted {wanted}")
@@ -127,7 +129,7 @@ def _complete(
             joint = joint._replace(speed=SPEED)
         joints.append(joint)
     if mute:
-        told.append(f"no torques are stated; assumed are {SPARE:g} times gravity's: {', '.join(mute)}")
+        told.append(f"no torques are stated; assumed is what carries and brakes the arm: {', '.join(mute)}")
     if still:
         told.append(f"no speeds are stated for {', '.join(still)}: {SPEED:g} rad/s is assumed")
     chosen = drive_table.chosen(names, joints)
@@ -145,19 +147,20 @@ def _complete(
     return joints, chosen
 
 
-def _gravity(arm: Arm) -> F64:
-    """Return the largest torques (n,) [Nm] of gravity within the limits."""
+def _loads(arm: Arm) -> tuple[F64, F64]:
+    """Return the largest torques of gravity (n,) [Nm] and inertias (n,) [kg m2] about each joint within the limits."""
     model, data = arm.model, arm.model.createData()
     low, high = np.array([j.low for j in arm.joints]), np.array([j.high for j in arm.joints])
     rng = np.random.default_rng(0)
-    most = np.zeros(len(arm.joints))
+    most, inertia = np.zeros(len(arm.joints)), np.zeros(len(arm.joints))
     for q in rng.uniform(low, high, (POSTURES, len(low))):
         full = pin.neutral(model)
         for k in range(1, model.njoints):
             at = model.idx_qs[k]
             full[at : at + model.nqs[k]] = [np.cos(q[k - 1]), np.sin(q[k - 1])] if model.nqs[k] == 2 else q[k - 1]
         most = np.maximum(most, np.abs(pin.computeGeneralizedGravity(model, data, full)))
-    return 1.1 * most  # the samples may have missed the worst
+        inertia = np.maximum(inertia, np.diag(pin.crba(model, data, full)))
+    return 1.1 * most, 1.1 * inertia  # the samples may have missed the worst
 
 
 def _within_reach(arm: Arm, solid: list[Piece]) -> list[Piece]:
