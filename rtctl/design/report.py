@@ -147,13 +147,16 @@ def _limits(r: Robot, found: Extremes) -> list[Row]:
     braking = found.inertia * _zone_speed(r) ** 2 / (2.0 * (f.rho0 - f.rho_min))
     spare = (r.tau_max - found.gravity) / np.maximum(braking, 1e-12)
     i, k = int(spare.argmin()), int((f.rho_num / f.rho_min).argmax())
+    note = f"torque gravity leaves over torque to brake, worst: {r.joints[i]}"
+    if spare[i] < 1.0:
+        note += "; limits and obstacles may be passed there: a lower qd_max_rad_s, or a stronger drive"
     return [
         _row("joint rho_num", f.rho_num[k], "rad", f"worst: {r.joints[k]}; at most the clearance {f.rho_min[k]:g}"),
         _row(
             "joint-limit braking",
             spare[i],
             "x",
-            f"torque gravity leaves over torque to brake, worst: {r.joints[i]}",
+            note,
             bool(spare[i] >= 1.0),
         ),
     ]
