@@ -12,7 +12,7 @@ import pytest
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
-from rtctl.app.postures import SLOTS, endings, site_of, skin_of
+from rtctl.app.postures import SLOTS, endings, inertia_of, previewed, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
@@ -203,6 +203,23 @@ def test_a_goal_that_the_tip_reaches_by_itself_needs_no_advice():
     guide.begin()
     goal = Goal(np.array([0.45, 0.1, 0.45]), UNIT, Task.POSITION, 0.003, 0.015)
     assert all(guide.advise(seen(HOME, goal, tick=k)) is None for k in range(30))
+
+
+@pytest.mark.parametrize("step", [(-0.033, 0.237, 0.199), (0.172, -0.054, -0.003)])
+def test_the_preview_ends_where_the_arm_does_light_joints_first(step: tuple[float, ...]):
+    with lab() as here:
+        here.running()
+        here.ask(here.simulator.truth().tip + np.array(step))
+        given, site = here.memory.goal, site_of(here.robot, here.memory.world.obstacles, here.memory.joints.q)
+        here.run(2.5)
+        ended = here.simulator.truth().q
+    assert given is not None
+    errors = []
+    for A in (inertia_of(site), np.eye(here.robot.n)):
+        Q, there = previewed(site, given, here.robot.q_rest, A)
+        assert there
+        errors.append(np.abs(Q[-1] - ended).max())
+    assert errors[0] < 0.25 < errors[1]  # [rad]
 
 
 def test_a_way_is_left_to_what_will_cross_it_and_taken_again():

@@ -16,6 +16,7 @@ from rtctl.app.postures import (
     Site,
     endings,
     free_of_all,
+    inertia_of,
     links_clear,
     own_room,
     packed,
@@ -83,7 +84,7 @@ def warm(robot: Robot) -> None:
     tip = robot.body.evaluate(robot.home, np.zeros(robot.n), robot.points)
     goal = Goal(tip.x, quat_of(tip.R), robot.axes, robot.tolerance, robot.tolerance_rot)
     endings(site, goal, 0, seeds=1)
-    previewed(site, goal, robot.q_rest)
+    previewed(site, goal, robot.q_rest, inertia_of(site))
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
     heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
     body, anchors = body_of(robot), robot.home[None]
@@ -172,12 +173,15 @@ class Guide:
             return self._planned(m, goal, site)
         if not self.robot.postures:
             return None
-        Q, there = previewed(site, goal, self.robot.q_rest)
-        if there and free_of_all(site, Q[-1]):
+        for A in (np.eye(self.robot.n), inertia_of(site)):  # the law's own way is more like the second
+            Q, there = previewed(site, goal, self.robot.q_rest, A)
+            if not there or not free_of_all(site, Q[-1]):
+                break
+        else:
             return None
         self.ends = self._endings(site, goal)
         for end in self.ends:
-            Q, there = previewed(site, goal, end.q)
+            Q, there = previewed(site, goal, end.q, A)
             if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
                 return self._given(end)
         led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)

@@ -146,8 +146,16 @@ def _unwound(site: Site, Q: F64, low: F64, high: F64) -> F64:
     return out
 
 
-def previewed(site: Site, goal: Goal, rest: F64) -> tuple[F64, bool]:
-    """Return the postures (k, n), STEP apart, in which the tip would go to a goal, and whether it gets there."""
+def inertia_of(site: Site) -> F64:
+    """Return the joint-space inertia (n, n) [kg m2] of the arm at the start."""
+    return site.robot.body.evaluate(site.start, np.zeros(site.robot.n), site.robot.points).A
+
+
+def previewed(site: Site, goal: Goal, rest: F64, A: F64) -> tuple[F64, bool]:
+    """Return the postures (k, n), STEP apart, in which the tip would go to a goal, and whether it gets there.
+
+    A (n, n): what the joints share the tip's way by; see `rollout`.
+    """
     robot, p = site.robot, site.robot.motion
     margin = 0.4 * robot.limit.rho0
     Q = rollout(
@@ -157,7 +165,7 @@ def previewed(site: Site, goal: Goal, rest: F64) -> tuple[F64, bool]:
         target_of(goal),
         robot.q_min + margin,
         robot.q_max - margin,
-        Pace(p.v_max, p.w_max, p.speed_margin * robot.qd_max, p.qdd_posture / p.d_q, p.k_q / p.d_q),
+        Pace(p.v_max, p.w_max, p.speed_margin * robot.qd_max, p.qdd_posture / p.d_q, p.k_q / p.d_q, A),
         STEP,
     )
     return Q, len(Q) <= ROLLOUT

@@ -231,6 +231,40 @@ def _damped_step(J: F64, e: F64, free: B1, damping: float) -> F64:
 
 
 @kernel
+def _easiest_step(J: F64, e: F64, A: F64, free: B1, damping: float) -> F64:
+    """Return M J^T (J M J^T + damping I)^-1 e, M the inverse of A (n, n), over its largest element, of what is free."""
+    k, n = J.shape
+    among = A.copy()
+    for i in range(n):
+        if not free[i]:
+            among[i, :], among[:, i] = 0.0, 0.0
+            among[i, i] = A[i, i]
+    M, JM, G, step = spd_inverse(among), np.zeros((k, n)), np.zeros((k, k)), np.zeros(n)
+    largest = 0.0
+    for i in range(n):
+        if free[i]:
+            largest = max(largest, M[i, i])
+    for a in range(k):
+        for i in range(n):
+            if free[i]:
+                for j in range(n):
+                    if free[j]:
+                        JM[a, i] += J[a, j] * (M[j, i] / largest)
+        for b in range(k):
+            for i in range(n):
+                G[a, b] += JM[a, i] * J[b, i]
+        G[a, a] += damping
+    G_inv = spd_inverse(G)
+    for a in range(k):
+        y = 0.0
+        for b in range(k):
+            y += G_inv[a, b] * e[b]
+        for i in range(n):
+            step[i] += JM[a, i] * y
+    return step
+
+
+@kernel
 def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tuple[F64, bool]:
     """Return a posture (n,) near q0 that has the goal within low and high (n,), and whether it has.
 
@@ -289,14 +323,16 @@ class Pace(NamedTuple):
     qd: F64  # (n,) [rad/s] at most
     drift: F64  # (n,) [rad/s] at most towards the posture
     gain: float  # [1/s] of that
+    A: F64  # (n, n) [kg m2] inertia, whose kinetic energy the motion keeps least; the identity: the speeds' squares
 
 
 @kernel
 def rollout(chain: Chain, q0: F64, rest: F64, goal: Target, low: F64, high: F64, pace: Pace, dt: float) -> F64:
     """Return the postures (k, n), dt [s] apart, of a tip that goes straight to a goal and joints that drift to `rest`.
 
-    The law without obstacles and inertia, to see where it would end: within low and high (n,) all the same. The last
-    posture has the goal where k is not more than ROLLOUT.
+    The law without obstacles, to see where it would end: within low and high (n,) all the same. Of all joint speeds
+    that move the tip so it takes those of least kinetic energy, as the law does, for an inertia that stays as it is.
+    The last posture has the goal where k is not more than ROLLOUT.
     """
     n = q0.shape[0]
     out, q, R, t = np.empty((ROLLOUT + 1, n)), q0.copy(), np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
@@ -327,7 +363,7 @@ def rollout(chain: Chain, q0: F64, rest: F64, goal: Target, low: F64, high: F64,
                 for i in range(n):
                     if free[i]:
                         wanted[a] -= Js[a, i] * drift[i]
-            step = _damped_step(Js, wanted, free, 1e-4)
+            step = _easiest_step(Js, wanted, pace.A, free, 1e-4)
             bound = False
             for i in range(n):
                 step[i] = step[i] + drift[i] if free[i] else 0.0
