@@ -10,6 +10,7 @@ from rtctl.arm import faults
 from rtctl.arm.disturbance import BANDWIDTH, LASTING, beyond, carried, observed, rounding, settled, slow_part
 from rtctl.arm.memory import fresh, record_of
 from rtctl.arm.sensing import _stick, _surprise
+from rtctl.experiment import rates, scene
 from rtctl.kernel.rotations import quat_of
 from tests.lab import ROOT, Lab, lab, robot
 
@@ -71,6 +72,20 @@ def test_what_nobody_told_of_is_carried_to_the_goal(name: str):
         assert 2.0 * np.arccos(min(abs(truth.tip_wxyz @ quat_of(R)), 1.0)) < 1e-2
         assert faults.names(here.servo.faults_seen) == ()
         assert {name for _, name, _ in here.servo.events} <= {"state", "moving", "arrived"}
+
+
+@pytest.mark.parametrize("hz", [225, 100])
+@pytest.mark.parametrize("plant", [{"payload_kg": 1.0}, {"coulomb_Nm": 0.5}, {"payload_kg": 1.0, "coulomb_Nm": 0.5}])
+def test_at_slow_rates_it_is_carried_as_well(hz: int, plant: dict[str, float]):
+    """The paper's rates and slower ones: the place is the plant's. Each was stopped by `innovation` on its way."""
+    goal = np.array(rates.LINE)
+    scenario = {"duration_s": 3.0, "goal": [{"at_s": rates.GIVEN, "position_m": goal.tolist()}], "plant": plant}
+    trace = scene.played(scenario, scene.config_file("panda"), changes=rates.changes_of(hz, 100))
+    assert trace.figures["faults"] == []
+    assert trace.figures["arrived"]
+    assert np.linalg.norm(trace.tip[-1] - goal) < 3e-3
+    rest = trace.tip[trace.rows(2.5, 3.0)]
+    assert np.ptp(rest, axis=0).max() < 3e-3
 
 
 def test_a_light_joint_that_sticks_under_a_payload_has_no_stuck_encoder():

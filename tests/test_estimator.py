@@ -26,8 +26,9 @@ from rtctl.arm.estimator import (
     update_pose,
     update_velocity,
 )
-from rtctl.design.filters import design, design_joint, tip_params
+from rtctl.design.filters import design, design_joint, lateness, tip_params
 from rtctl.types import F64
+from tests.lab import robot
 
 ROOT = Path(__file__).resolve().parent.parent
 DT, RATIO = 1e-3, 4
@@ -37,8 +38,8 @@ LSB_Q, LSB_QD = 25.0 / 65535, 90.0 / 4095  # of a 16 and a 12 bit field
 ZERO = np.zeros(3)
 
 
-def joint_params(n: int, has_qd: bool, sigma: float = 20.0) -> JointParams:
-    return JointParams(np.full(n, sigma), np.full(n, LSB_Q / 12**0.5), np.full(n, LSB_QD / 12**0.5), has_qd)
+def joint_params(n: int, has_qd: bool, sigma: float = 20.0, as_then: bool = False) -> JointParams:
+    return JointParams(np.full(n, sigma), np.full(n, LSB_Q / 12**0.5), np.full(n, LSB_QD / 12**0.5), has_qd, as_then)
 
 
 def axis_filter(x: float, xd: float, P: F64) -> KalmanFilter:
@@ -62,7 +63,7 @@ def measure(kf: KalmanFilter, z: float, h: tuple[float, float], r: float) -> flo
     return float(kf.y[0, 0] / np.sqrt(kf.S[0, 0]))
 
 
-def steady(sigma: float, r_v: float, r_x: float, ratio: int, age: float, has_velocity: bool) -> tuple[F64, F64, F64]:
+def steady(sigma: float, r_v: float, r_x: float, ratio: int, age: float) -> tuple[F64, F64, F64]:
     """Return covariance and gains of filterpy's filter once a cycle of updates leaves them as they were."""
     kf = axis_filter(0.0, 0.0, np.diag([r_x * r_x, r_v * r_v]))
     gain_velocity = np.zeros(2)
@@ -70,9 +71,8 @@ def steady(sigma: float, r_v: float, r_x: float, ratio: int, age: float, has_vel
         before = kf.P.copy()
         for _ in range(ratio):
             step(kf, 0.0, DT, sigma)
-            if has_velocity:
-                measure(kf, 0.0, (0.0, 1.0), r_v)
-                gain_velocity = kf.K[:, 0].copy()
+            measure(kf, 0.0, (0.0, 1.0), r_v)
+            gain_velocity = kf.K[:, 0].copy()
         measure(kf, 0.0, (1.0, -age), r_x)
         if np.allclose(kf.P, before, rtol=1e-10, atol=0.0):
             break
@@ -83,12 +83,12 @@ def steady(sigma: float, r_v: float, r_x: float, ratio: int, age: float, has_vel
 def test_the_tips_steady_state_is_filterpys(age: float) -> None:
     d, p = design(PARAMS, DT, RATIO, age), PARAMS
     for mine, theirs in zip(
-        (d.P, d.gain_velocity, d.gain_pose), steady(p.sigma_a, p.r_v, p.r_x, RATIO, age, True), strict=True
+        (d.P, d.gain_velocity, d.gain_pose), steady(p.sigma_a, p.r_v, p.r_x, RATIO, age), strict=True
     ):
         assert_allclose(mine, theirs, rtol=1e-8)
     for mine, theirs in zip(
         (d.P_rot, d.gain_velocity_rot, d.gain_pose_rot),
-        steady(p.sigma_alpha, p.r_omega, p.r_rot, RATIO, age, True),
+        steady(p.sigma_alpha, p.r_omega, p.r_rot, RATIO, age),
         strict=True,
     ):
         assert_allclose(mine, theirs, rtol=1e-8)
@@ -97,9 +97,20 @@ def test_the_tips_steady_state_is_filterpys(age: float) -> None:
 
 @pytest.mark.parametrize("has_qd", [True, False])
 def test_a_joints_steady_covariance_is_filterpys(has_qd: bool) -> None:
-    p = joint_params(1, has_qd)
-    P, _, _ = steady(p.sigma_qdd[0], p.r_qd[0], p.r_q[0], 1, DT, has_qd)
-    assert_allclose(design_joint(p, DT, DT)[0], P, rtol=1e-8)
+    for dt, age, as_then in ((DT, DT, False), (1e-2, 1e-2, True), (1e-2, 6e-3, True)):
+        p = joint_params(1, has_qd, as_then=as_then)
+        since = age if as_then else 0.0  # measured within a step, which goes on after it
+        kf = axis_filter(0.0, 0.0, np.diag([p.r_q[0] ** 2, p.r_qd[0] ** 2]))
+        for _ in range(3_000):
+            step(kf, 0.0, dt - since, p.sigma_qdd[0])
+            measure(kf, 0.0, (1.0, since - age), p.r_q[0])
+            if has_qd:
+                measure(kf, 0.0, (0.0, 1.0), p.r_qd[0])
+            measured = kf.P.copy()
+            step(kf, 0.0, since, p.sigma_qdd[0])
+        found = design_joint(p, dt, age)
+        assert_allclose(found.measured[0], measured, rtol=1e-7)
+        assert_allclose(found.now[0], kf.P, rtol=1e-7)
 
 
 def test_each_axis_of_the_tip_is_filterpys_filter_step_by_step() -> None:
@@ -261,35 +272,81 @@ def test_an_estimate_goes_in_unchanged_and_shares_nothing_with_the_next() -> Non
     assert not any(np.shares_memory(a, b) for a in est for b in later)
 
 
+@pytest.mark.parametrize(("period", "as_then"), [(DT, False), (DT, True), (1.0 / 225.0, True)])
 @pytest.mark.parametrize("has_qd", [True, False])
-def test_each_joint_is_filterpys_filter_step_by_step(has_qd: bool) -> None:
+def test_each_joint_is_filterpys_filter_step_by_step(has_qd: bool, period: float, as_then: bool) -> None:
     n, rng = 7, np.random.default_rng(3)
-    params = joint_params(n, has_qd)._replace(sigma_qdd=rng.uniform(5.0, 50.0, n))
+    params = joint_params(n, has_qd, as_then=as_then)._replace(sigma_qdd=rng.uniform(5.0, 50.0, n))
     P = np.array([[[1e-6, 1e-6], [1e-6, 1e-3]]] * n)
     est = JointEstimate(rng.normal(size=n), rng.normal(size=n), P)
     bank = [axis_filter(est.q[i], est.qd[i], P[i]) for i in range(n)]
     for _ in range(400):
-        dt, qdd = DT * rng.integers(1, 3), rng.normal(scale=20.0, size=n)
-        age, fresh = rng.uniform(0.0, 3e-3, n), rng.random(n) < 0.9
+        dt, qdd = period * rng.integers(1, 3), rng.normal(scale=20.0, size=n)
+        age, fresh = rng.uniform(0.0, 3.0 * period, n), rng.random(n) < 0.9
         q, qd = est.q + rng.normal(scale=LSB_Q, size=n), est.qd + rng.normal(scale=LSB_QD, size=n)
         est, innovation = joint_step(est, qdd, q, qd, age, fresh, dt, params)
         for i, kf in enumerate(bank):
-            step(kf, qdd[i], dt, params.sigma_qdd[i])
-            expected = 0.0
-            if fresh[i]:  # the known acceleration moves what was measured `age` ago, as a known offset
-                offset = 0.5 * age[i] ** 2 * qdd[i]
-                expected = abs(measure(kf, q[i] - offset, (1.0, -age[i]), params.r_q[i]))
+            since = min(age[i], dt) if fresh[i] and as_then else 0.0  # of the step, after the measurement
+            late, expected = age[i] - since, 0.0
+            step(kf, qdd[i], dt - since, params.sigma_qdd[i])
+            if fresh[i]:  # where it is older than that, the known acceleration is a known offset
+                offset = 0.5 * late**2 * qdd[i]
+                expected = abs(measure(kf, q[i] - offset, (1.0, -late), params.r_q[i]))
                 if has_qd:
-                    expected = max(expected, abs(measure(kf, qd[i] + age[i] * qdd[i], (0.0, 1.0), params.r_qd[i])))
+                    expected = max(expected, abs(measure(kf, qd[i] + late * qdd[i], (0.0, 1.0), params.r_qd[i])))
+                step(kf, qdd[i], since, params.sigma_qdd[i])
             assert_allclose([est.q[i], est.qd[i]], kf.x[:, 0], rtol=1e-9, atol=1e-9)
             assert_allclose(est.P[i], kf.P, rtol=1e-9, atol=1e-15)
             assert innovation[i] == pytest.approx(expected, rel=1e-8, abs=1e-9)
 
 
+@pytest.mark.parametrize("dt", [1.0 / 225.0, 1e-2])
+def test_accelerations_as_stated_are_a_surprise_of_one_to_old_replies_at_slow_rates(dt: float) -> None:
+    rng, params = np.random.default_rng(6), joint_params(1, True, as_then=True)
+    q, qd = np.zeros(1), np.zeros(1)
+    est = joint_start(q, design_joint(params, dt, dt).now)
+    age, fresh, surprises, errors = np.full(1, dt), np.ones(1, np.bool_), [], []
+    for _ in range(20_000):
+        seen = q + rng.normal(scale=params.r_q, size=1), qd + rng.normal(scale=params.r_qd, size=1)  # a period old
+        qdd = rng.normal(scale=params.sigma_qdd, size=1)
+        q, qd = q + dt * qd + 0.5 * dt * dt * qdd, qd + dt * qdd
+        est, innovation = joint_step(est, np.zeros(1), *seen, age, fresh, dt, params)
+        surprises.append(innovation[0])
+        errors.append([(est.q[0] - q[0]) / est.P[0, 0, 0] ** 0.5, (est.qd[0] - qd[0]) / est.P[0, 1, 1] ** 0.5])
+    # the larger of two normal numbers: 1 + 2/pi in the mean of its square
+    assert np.mean(np.square(surprises)) == pytest.approx(1.0 + 2.0 / np.pi, rel=0.04)
+    assert np.std(errors, axis=0) == pytest.approx([1.0, 1.0], rel=0.04)
+
+
+@pytest.mark.parametrize(("dt", "ratio"), [(1.0 / 225.0, 2), (1e-2, 1)])
+def test_a_lasting_acceleration_that_nobody_knew_of_is_less_than_what_a_pose_may_come_late_by(
+    dt: float, ratio: int
+) -> None:
+    """A joint of lever 1 m that is accelerated by twice its deviation: true, by its parabola, the tip's by the arc."""
+    p = joint_params(1, True, as_then=True)
+    qdd, P = 2.0 * p.sigma_qdd[0], design_joint(p, dt, dt)
+    J = np.zeros((6, 1))
+    J[0, 0] = 1.0
+    tip = tip_params(J, P.measured, 5.0, 20.0, lateness(p, dt, ratio * dt))._replace(r_rot=1.0, r_omega=1.0)
+    est, arm = start(ZERO, np.eye(3), design(tip, dt, ratio, 0.0)), joint_start(np.zeros(1), P.now)
+    surprises, age, fresh = [], np.full(1, dt), np.ones(1, np.bool_)
+    for k in range(1, 41):
+        then = (k - 1) * dt
+        arm, _ = joint_step(
+            arm, np.zeros(1), np.full(1, 0.5 * qdd * then**2), np.full(1, qdd * then), age, fresh, dt, p
+        )
+        est = predict(est, ZERO, ZERO, dt, tip)
+        est, _ = update_velocity(est, J[:3, 0] * arm.qd[0], ZERO, tip)
+        if k % ratio == 0:
+            est, surprise = update_pose(est, J[:3, 0] * arm.q[0], np.eye(3), 0.0, tip)
+            surprises.append(surprise)
+    assert max(surprises) < 3.0
+
+
 @pytest.mark.parametrize("has_qd", [True, False])
 def test_the_joint_design_is_where_the_compiled_bank_settles(has_qd: bool) -> None:
     params = joint_params(3, has_qd)._replace(sigma_qdd=np.array([5.0, 20.0, 80.0]))
-    P = design_joint(params, DT, DT)
+    P = design_joint(params, DT, DT).now
     zero, age, fresh = np.zeros(3), np.full(3, DT), np.ones(3, np.bool_)
     est = joint_start(zero, np.array([np.diag([1e-2, 1.0])] * 3))
     for _ in range(5000):
@@ -312,7 +369,7 @@ def followed(params: JointParams, knows_qdd: bool) -> tuple[F64, F64, F64]:
     q, qd, qdd = trajectory(t)
     q_then, qd_then, _ = trajectory(t - DT)
     seen, seen_d = np.round(q_then / LSB_Q) * LSB_Q, np.round(qd_then / LSB_QD) * LSB_QD
-    est = joint_start(q[:1], design_joint(params, DT, DT))._replace(qd=qd[:1])
+    est = joint_start(q[:1], design_joint(params, DT, DT).now)._replace(qd=qd[:1])
     out = np.empty((2, len(t)))
     age, fresh = np.full(1, DT), np.ones(1, np.bool_)
     for k in range(len(t)):
@@ -352,7 +409,7 @@ def test_a_quantised_encoder_gives_position_and_speed_of_now(
 def test_a_joint_at_rest_has_no_speed() -> None:
     params = joint_params(2, False)
     seen = np.round(np.array([0.3, -1.2]) / LSB_Q) * LSB_Q
-    est = joint_start(seen + 0.4 * LSB_Q, design_joint(params, DT, DT))
+    est = joint_start(seen + 0.4 * LSB_Q, design_joint(params, DT, DT).now)
     zero, age, fresh = np.zeros(2), np.full(2, DT), np.ones(2, np.bool_)
     for _ in range(800):
         est, _ = joint_step(est, zero, seen, zero, age, fresh, DT, params)
@@ -362,7 +419,7 @@ def test_a_joint_at_rest_has_no_speed() -> None:
 
 def test_a_joint_that_does_not_reply_coasts_and_grows_unsure() -> None:
     params = joint_params(2, True)
-    est = JointEstimate(np.array([1.0, 1.0]), np.array([0.5, 0.5]), design_joint(params, DT, DT))
+    est = JointEstimate(np.array([1.0, 1.0]), np.array([0.5, 0.5]), design_joint(params, DT, DT).now)
     silent, age = np.array([False, True]), np.full(2, DT)
     for k in range(1, 11):
         seen = 1.0 + 0.5 * (k - 1) * DT
@@ -376,6 +433,14 @@ def test_a_joint_that_does_not_reply_coasts_and_grows_unsure() -> None:
     assert innovation[1] > innovation[0] > 8.0  # an unsure joint is surprised less
 
 
+@pytest.mark.parametrize("name", ["openarm", "openarm_e2e", "panda", "planar4", "puma560", "ur5"])
+def test_at_the_rates_of_the_shipped_arms_a_reply_is_as_of_now_and_no_pose_is_late(name: str) -> None:
+    """What their logs hold is replayed to the bit: the filters of slow rates begin below them."""
+    arm = robot(ROOT / "configs" / f"{name}.toml")
+    assert not arm.joint_filter.as_then
+    assert (arm.estimator.late_x, arm.estimator.late_rot) == (0.0, 0.0)
+
+
 def test_the_tips_noise_is_what_noisy_joints_give() -> None:
     rng = np.random.default_rng(4)
     J, n = rng.normal(scale=0.5, size=(6, 7)), 7
@@ -386,6 +451,10 @@ def test_the_tips_noise_is_what_noisy_joints_give() -> None:
     assert [params.r_x, params.r_rot] == pytest.approx([seen[:3].max(), seen[3:].max()], rel=0.02)
     assert [params.r_v, params.r_omega] == pytest.approx([100.0 * params.r_x, 100.0 * params.r_rot], rel=1e-9)
     assert (params.sigma_a, params.sigma_alpha) == (5.0, 20.0)
+    assert (params.late_x, params.late_rot) == (0.0, 0.0)
+    late = tip_params(J, P, 5.0, 20.0, 1e-4 * scale)
+    assert [late.late_x, late.late_rot] == pytest.approx([params.r_x, params.r_rot], rel=1e-9)
+    assert late[:6] == params[:6]
 
 
 def _digest() -> str:

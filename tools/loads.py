@@ -3,6 +3,7 @@
     python -m tools.loads                  # the loads of tests/test_disturbance.py
     python -m tools.loads openarm_e2e panda
     python -m tools.loads --write          # and into docs/loads.md
+    python -m tools.loads --hz 225 100     # at other rates, of servo and model, as `rtctl experiment rates` has them
 
 The plant's truth judges: error and angle at the end, the tip's hunting in the last second. The last row of each arm is
 told friction that is not there: too much is given.
@@ -11,11 +12,14 @@ told friction that is not there: too much is given.
 import argparse
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.experiment import rates
+from rtctl.experiment.scene import variant
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import Payload, Request
 from tests.lab import ROOT, lab
@@ -64,12 +68,15 @@ def arrival(path: Path, name: str, plant: dict[str, Any], payload: float) -> Arr
         )
 
 
-def judged(name: str) -> tuple[list[str], int]:
-    """Return the rows of an arm, as they are printed, and how many of them pass a bound."""
+def judged(name: str, hz: Sequence[int] | None = None) -> tuple[list[str], int]:
+    """Return the rows of an arm, as they are printed, and how many of them pass a bound; hz: of servo and model."""
     case, plain, out, bad = CASES[name], ROOT / "configs" / f"{name}.toml", [], 0
     both = {"payload_kg": case.payload, "coulomb_Nm": case.coulomb}
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as other:
         file = told(Path(folder), name)
+        if hz is not None:
+            changes = rates.changes_of(hz[0], hz[1])
+            file, plain = variant(file, Path(folder), changes), variant(plain, Path(other), changes)
         rows = [
             ("none", arrival(plain, name, {}, 0.0), 1e-3),
             ("untold", arrival(plain, name, both, 0.0), 3e-3),
@@ -99,10 +106,13 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("arms", nargs="*", help=f"of {', '.join(CASES)}; default: all")
     parser.add_argument("--write", action="store_true", help="put the table into docs/loads.md")
+    parser.add_argument("--hz", type=int, nargs=2, metavar=("SERVO", "MODEL"), help="rates; default: those of the file")
     asked, bad, rows = parser.parse_args(arguments), 0, list(HEAD)
+    if asked.write and asked.hz:
+        parser.error("--write is for the rates of the files")
     print("\n".join(HEAD))
     for name in asked.arms or list(CASES):
-        more, beyond = judged(name)
+        more, beyond = judged(name, asked.hz)
         rows, bad = rows + more, bad + beyond
     if asked.write:
         PAGE.write_text(written(PAGE.read_text(encoding="utf-8"), rows), encoding="utf-8")

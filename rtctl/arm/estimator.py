@@ -26,6 +26,8 @@ class EstimatorParams(NamedTuple):
     r_omega: float  # [rad/s]
     r_x: float  # [m] of x = fk(q)
     r_rot: float  # [rad]
+    late_x: float = 0.0  # [m] by which x may come late: no noise to the filter, and no surprise; see `tip_params`
+    late_rot: float = 0.0  # [rad]
 
 
 class TipEstimate(NamedTuple):
@@ -59,6 +61,7 @@ class JointParams(NamedTuple):
     r_q: F64  # (n,) [rad] standard deviation of a measured position: LSB / sqrt(12) of the encoder
     r_qd: F64  # (n,) [rad/s] of a measured velocity
     has_qd: bool  # the drive reports a velocity worth using
+    as_then: bool = False  # a reply corrects the joint as it was when it was measured, not as it is a period later
 
 
 class JointEstimate(NamedTuple):
@@ -186,14 +189,22 @@ def update_pose(est: TipEstimate, x: F64, R: F64, age: float, params: EstimatorP
     for i in range(3):
         turn[i] = -age * est.omega[i]
     y_rot = error(compose(exp3(turn), est.R), R)
-    total = 0.0
+    late, late_rot, total = params.late_x * params.late_x, params.late_rot * params.late_rot, 0.0
     for i in range(3):
         y = x[i] - (est.x[i] - age * est.xd[i])
         x1[i], xd1[i] = est.x[i] + k0 * y, est.xd[i] + k1 * y
         turn[i], omega1[i] = l0 * y_rot[i], est.omega[i] + l1 * y_rot[i]
-        total += y * y / S + y_rot[i] * y_rot[i] / S_rot
+        total += y * y / (S + late) + y_rot[i] * y_rot[i] / (S_rot + late_rot)
     turned = orthonormal(compose(exp3(turn), est.R))
     return TipEstimate(x1, xd1, matrix(P), turned, omega1, matrix(P_rot)), math.sqrt(total / 6.0)
+
+
+@kernel
+def _moved_on(
+    q: float, qd: float, P: Covariance, qdd: float, dt: float, sigma: float
+) -> tuple[float, float, Covariance]:
+    """Return position, speed and their covariance dt [s] later; qdd [rad/s2] but for what has deviation sigma."""
+    return q + dt * (qd + 0.5 * dt * qdd), qd + dt * qdd, propagate(P, dt, sigma)
 
 
 @kernel
@@ -204,15 +215,19 @@ def joint_step(
 
     qdd: (n,) [rad/s2] acceleration the model expects, zero when unknown. q, qd: (n,) measured. age: (n,) [s].
     replies: (n,) measurements that this cycle brought of each joint; those without coast, with innovation 0.
+
+    As it was then: an acceleration that is not known has not acted on what was measured before it. Were it taken to
+    have, a position that is ahead would say that the joint was braked since, and turn the filter the wrong way: within
+    the encoder's noise at 1 kHz, and all there is at 100 Hz. See `design.filters.SLOW`.
     """
     n = q.shape[0]
     q1, qd1, P, innovation = np.empty(n), np.empty(n), np.empty((n, 2, 2)), np.zeros(n)
     for i in range(n):
-        position = est.q[i] + dt * (est.qd[i] + 0.5 * dt * qdd[i])
-        speed = est.qd[i] + dt * qdd[i]
-        C = propagate(covariance(est.P[i]), dt, params.sigma_qdd[i])
+        sigma = params.sigma_qdd[i]
+        since = min(age[i], dt) if params.as_then and replies[i] > 0 else 0.0  # of the step, after the measurement
+        t = age[i] - since  # and that much older it is than where the step has come to
+        position, speed, C = _moved_on(est.q[i], est.qd[i], covariance(est.P[i]), qdd[i], dt - since, sigma)
         if replies[i] > 0:
-            t = age[i]
             y = q[i] - (position - t * speed + 0.5 * t * t * qdd[i])
             S, k0, k1, C = correct(C, 1.0, -t, params.r_q[i])
             position, speed = position + k0 * y, speed + k1 * y
@@ -222,6 +237,8 @@ def joint_step(
                 S, k0, k1, C = correct(C, 0.0, 1.0, params.r_qd[i])
                 position, speed = position + k0 * y, speed + k1 * y
                 innovation[i] = max(innovation[i], abs(y) / math.sqrt(S))
+            if since > 0.0:
+                position, speed, C = _moved_on(position, speed, C, qdd[i], since, sigma)
         q1[i], qd1[i] = position, speed
         P[i, 0, 0], P[i, 0, 1], P[i, 1, 0], P[i, 1, 1] = C.xx, C.xv, C.vx, C.vv
     return JointEstimate(q1, qd1, P), innovation

@@ -109,13 +109,19 @@ def _estimator(c: RecordRow) -> EstimatorParams:
         c.estimator_r_omega,
         c.estimator_r_x,
         c.estimator_r_rot,
+        c.estimator_late_x,
+        c.estimator_late_rot,
     )
 
 
 @kernel
 def _joint_filter(c: RecordRow, n: int) -> JointParams:
     return JointParams(
-        c.joint_sigma_qdd[:n].copy(), c.joint_r_q[:n].copy(), c.joint_r_qd[:n].copy(), c.joint_has_qd != 0.0
+        c.joint_sigma_qdd[:n].copy(),
+        c.joint_r_q[:n].copy(),
+        c.joint_r_qd[:n].copy(),
+        c.joint_has_qd != 0.0,
+        c.joint_as_then != 0.0,
     )
 
 

@@ -31,7 +31,7 @@ from rtctl.control.firas import rooms_of
 from rtctl.design import points as psp
 from rtctl.design.assets import Assets, load_assets, placed
 from rtctl.design.description import notes
-from rtctl.design.filters import design, design_joint, tip_params
+from rtctl.design.filters import SLOW, design, design_joint, lateness, tip_params
 from rtctl.design.mobility import mobility
 from rtctl.design.pairs import watched
 from rtctl.errors import ConfigError
@@ -430,14 +430,16 @@ def _filters(c: Config, body: RigidBody, home: F64) -> Filters:
         r_q=np.hypot(lsb_p / np.sqrt(12.0), e.position_noise_rad),
         r_qd=np.hypot(lsb_v / np.sqrt(12.0), e.velocity_noise_rad_s),
         has_qd=e.joint_velocity,
+        as_then=dt > SLOW,
     )
     kinds, of = np.unique(np.stack(joint_filter[:3], axis=1), axis=0, return_inverse=True)  # equal drives, one design
-    joint_P = design_joint(JointParams(kinds[:, 0], kinds[:, 1], kinds[:, 2], e.joint_velocity), dt, dt)[of.ravel()]
+    P = design_joint(joint_filter._replace(sigma_qdd=kinds[:, 0], r_q=kinds[:, 1], r_qd=kinds[:, 2]), dt, dt)
     J = body.evaluate(home, np.zeros(n), no_points()).J
-    tip = tip_params(J, joint_P, e.acceleration_m_s2, e.acceleration_rad_s2)
+    late = lateness(joint_filter, dt, 1.0 / c.loop.model_hz)
+    tip = tip_params(J, P.measured[of.ravel()], e.acceleration_m_s2, e.acceleration_rad_s2, late)
     ratio = max(1, round(c.loop.servo_hz / c.loop.model_hz))
     # joints are predicted to now, so a pose has no age
-    return Filters(tip, design(tip, dt, ratio, 0.0), joint_filter, joint_P)
+    return Filters(tip, design(tip, dt, ratio, 0.0), joint_filter, P.now[of.ravel()])
 
 
 def _safety(c: Config, tau_rated: F64) -> SafetyParams:

@@ -55,9 +55,10 @@ def run(say: Say = unsaid, pairs: tuple[tuple[int, int], ...] = PAIRS) -> Data:
     return Data([_played(config, *case, saying(k)) for k, case in enumerate(cases)])
 
 
-def _played(config: Path, servo: int, model: int, carry: bool, say: Say) -> Run:
+def changes_of(servo: int, model: int, carry: bool = True) -> dict[str, dict[str, object]]:
+    """Return the keys of a config that are changed for a pair of rates [Hz]."""
     period = 1e3 / servo
-    changes: dict[str, dict[str, object]] = {
+    return {
         "loop": {"servo_hz": servo, "model_hz": model},
         "safety": {
             "watchdog_ms": 5.0 * period + MARGIN_MS,
@@ -68,12 +69,15 @@ def _played(config: Path, servo: int, model: int, carry: bool, say: Say) -> Run:
         "avoid": {"self_clearance_m": 0.018, "self_influence_m": 0.04, "joint_clearance_rad": 0.05},
         "estimator": {"carry": carry},
     }
+
+
+def _played(config: Path, servo: int, model: int, carry: bool, say: Say) -> Run:
     scenario = {
         "duration_s": END,
         "goal": [{"at_s": GIVEN, "position_m": list(LINE)}, {"at_s": THEN, "position_m": list(PAST)}],
         "obstacle": [BALL],
     }
-    trace = played(scenario, config, say, changes)
+    trace = played(scenario, config, say, changes_of(servo, model, carry))
     f = trace.figures
     return Run(
         servo,
