@@ -40,7 +40,7 @@ def reactions() -> str:
         ("reaction", "state", "torque", "cut when", "cut at once by", "the plant is held to"),
         ("---",) * 6,
         ("SS2", "SAFE_STOP", "the law brakes, then holds", "never", "a fault of SS1 or STO", ways),
-        ("SS1", "SAFE_STOP", "-D qd + g", rest, watched, ways),
+        ("SS1", "SAFE_STOP", "-(D + decay A) qd + g", rest, watched, ways),
         ("SS1, a measurement lies", "SAFE_STOP", "g of the last posture fades", f"{s.FADE:g} s", "the same", ways),
         ("SS1, no brakes", "SAFE_STOP", own, f"lowered, and rests {o.RESTS:g} s", "STO alone: it would fall", falls),
         ("STO", "FAULT", "none", "at once", "", "brakes hold; without them it falls"),

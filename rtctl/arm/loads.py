@@ -20,6 +20,7 @@ from rtctl.arm.disturbance import (
     slow_part,
     within,
 )
+from rtctl.arm.faults import BIT, DISTRUST
 from rtctl.arm.friction import GUIDED, rubbing, sliding, speeds_of
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import drives_torque
@@ -27,14 +28,15 @@ from rtctl.arm.target import parking_progress, target_of
 from rtctl.arm.task import task_error
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
-from rtctl.types import F64, Feedback, RecordRow, State
+from rtctl.types import F64, Feedback, RecordRow, Severity, State
 
 UNFELT = 2.0  # times what is noticeable: a hand that pushes a joint less than that does not move it
 GENTLE = 0.4  # of the damping of a stop: an arm that is let go comes to rest within half a second
 FINE, FINE_ROT = 1e-3, 5e-3  # [m], [rad] a goal's tolerance below them does not make the arm push on
 
-# numbers of the enumeration, as compiled code reads them
-_ARMED, _RUN = int(State.ARMED), int(State.RUN)
+# numbers of the enumerations, as compiled code reads them
+_ARMED, _RUN, _SAFE_STOP, _SS1 = int(State.ARMED), int(State.RUN), int(State.SAFE_STOP), int(Severity.SS1)
+_STRUCK = BIT["collision_hard"]
 
 
 @kernel
@@ -47,10 +49,10 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
         m.noticed, m.settled, m.touches, m.contact_level = 0, 0, 0, 0
         m.track[:n], m.unsure[:n], m.expected[:n], m.steady[:n] = 0.0, 0.0, 0.0, 0.0
         return
-    load, resting = np.empty(n), True
+    load, resting, silent = np.empty(n), True, False
     for i in range(n):
         if not (f.replies[i] > 0 and np.isfinite(qd[i])):
-            qd[i] = m.qd_measured[i]
+            qd[i], silent = m.qd_measured[i], True
         load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i] + c.coulomb[i] * sliding(m.qd[i])
         resting = resting and abs(qd[i]) < RESTING
     # the speed measured now ends the period in which the command before the last one was applied
@@ -63,8 +65,11 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     for i in range(n):
         moved = f.replies[i] > 0 and f.q[i] != m.q_previous[i]
         m.external_moving[i] += (follow if moved else drift) * (external[i] - m.external_moving[i])
+    if _damped(c, m) and not silent:
+        bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
+        m.lasting[:n] = slow_part(m.lasting[:n].copy(), external, bound, elapsed)
     if m.state != _RUN:
-        return  # a stop goes on with what was known
+        return  # any other stop goes on with what was known
     m.settled = 1 if m.floating == 0 and settled(m.settled != 0, resting, _error(c, m, n)) else 0
     bound = carried(model.J, c.payload_max, c.friction_max[:n].copy())
     if m.floating != 0:  # what a hand does is not learnt: the weight found before, where the tip is now
@@ -74,6 +79,18 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     least = c.noticeable[:n].copy()
     if m.noticed == 0 and beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least)):
         m.noticed = 1
+
+
+@kernel
+def _damped(c: RecordRow, m: RecordRow) -> bool:
+    """Return whether the arm is being damped, and what lasts is learnt on.
+
+    A brake that closes in motion, or whatever else stops the arm, jerks it: what the observer took of that to last
+    would drive the arm for as long as it is damped. Not where a measurement lies, nor against what was struck; nor
+    while a joint is silent, whose braking would be taken for a load.
+    """
+    trusted = m.in_force & (DISTRUST | _STRUCK) == 0
+    return bool(m.state == _SAFE_STOP and m.reaction >= _SS1 and m.off == 0 and c.brakeless == 0.0 and trusted)
 
 
 @kernel

@@ -22,7 +22,7 @@ SLOTS = 64  # obstacle slots: the size of every array over obstacles
 class StopParams(NamedTuple):
     """How the arm is brought to rest when it must stop."""
 
-    damping: F64  # (n,) [Nms/rad] D of the damped stop -D qd + g(q): A_ii(home) times the rate of decay
+    damping: F64  # (n,) [Nms/rad] D of the damped stop -(D + decay A) qd + g: A_ii(home) times the rate of decay
     decay: float  # [1/s] with which a stopping joint loses its speed
     kp: F64  # (n,) [Nm/rad] of the drives' own loops, where they hold the arm
     kd: F64  # (n,) [Nms/rad]

@@ -124,11 +124,14 @@ def _astray(c: RecordRow, m: RecordRow, n: int) -> bool:
 
 
 @kernel
-def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, g: F64) -> F64:
+def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, A: F64, g: F64) -> F64:
     """Return the torque (n,) [Nm] of a stop, and note when it is over.
 
-    Where the measurements are true it is damped: -D qd + g. Where one of them lies, -D qd and the g of the next
-    posture drive the arm away: then g fades within FADE, and the brakes have it.
+    Where the measurements are true it is damped: -(D + decay A) qd + g. By A every motion decays at that rate at least,
+    in any posture: D alone damps the joints one by one, and those of a stretched arm go on together for several times
+    as long. By D motions with little inertia are braked, too: A alone leaves them to what is not known of the load.
+    Where a measurement lies, either and the g of the next posture drive the arm away: then g fades within FADE, and the
+    brakes have it.
     """
     since = (m.tick - m.since) * c.dt
     distrust = m.in_force & DISTRUST != 0
@@ -138,9 +141,11 @@ def _stop_torque(c: RecordRow, m: RecordRow, f: Feedback, g: F64) -> F64:
     if distrust:
         keep *= max(1.0 - since / FADE, 0.0)
         return keep
-    for i in range(g.shape[0]):  # a velocity that old damps nothing
-        fresh = 1.0 if f.age[i] <= c.safety_lost_periods * c.dt else 0.0
-        keep[i] = g[i] - c.stop_damping[i] * m.qd[i] * fresh
+    for k in range(g.shape[0]):
+        if f.age[k] <= c.safety_lost_periods * c.dt:  # a velocity that old damps nothing
+            keep[k] -= c.stop_damping[k] * m.qd[k]
+            for i in range(g.shape[0]):
+                keep[i] -= c.stop_decay * A[i, k] * m.qd[k]
     return keep
 
 
@@ -204,7 +209,7 @@ def limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64)
     n, noticed = f.q.shape[0], m.noticed != 0
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
     if m.state == _SAFE_STOP and m.reaction >= _SS1:  # damp or fade, then torque off
-        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.g - m.lasting[:n] if noticed else model.g)
+        drive, keep = np.zeros(n), _stop_torque(c, m, f, model.A, model.g - m.lasting[:n] if noticed else model.g)
     command, qd = _torque_asked(c, m, f), m.qd[:n].copy()
     bounds = TorqueBounds(c.tau_max[:n].copy(), c.tau_rate[:n].copy(), c.tau_lsb[:n].copy(), c.stop_damping[:n].copy())
     within, follows = command_torque(TorqueParts(drive, keep), qd, m.sent[:, :n].copy(), f, bounds, c.dt)
