@@ -23,7 +23,7 @@ __all__ = ["Robot", "initial", "load", "plan", "read", "simulate", "tick"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'rtctl' has no attribute {name!r}; it offers {', '.join(__all__)}")
-    home = "rtctl.app.plan" if name == "plan" else "rtctl.library"  # the planner is an extra of its own
+    home = "rtctl.app.plan" if name == "plan" else "rtctl.library"
     value = globals()[name] = getattr(import_module(home), name)
     return value
 

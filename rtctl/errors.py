@@ -71,7 +71,6 @@ EXTRAS = {  # modules that the core does without, and the extra of the package t
     "mujoco": "sim",
     "pybullet": "sim",
     "pybullet_data": "sim",
-    "ompl": "plan",
     "matplotlib": "report",
     "PIL": "report",
     "pyarrow": "report",

@@ -191,6 +191,23 @@ def test_where_points_stand_out_too_far_the_links_themselves_are_measured():
     assert gained > 0
 
 
+def test_what_is_far_is_left_out_of_a_look_and_nothing_else():
+    """Free are the postures in which every point keeps the room, placed by Pinocchio and measured one by one."""
+    arm, rng = robot(), np.random.default_rng(5)
+    size, at = np.array([0.2, 0.3, 0.02, 0.0]), np.array([0.5, 0.1, 0.3])
+    slab = Shape("slab", "box", size, at, UNIT, np.zeros(3), np.zeros(3))
+    obstacles = around(ball(np.array([0.3, -0.4, 0.5])), ball(np.array([-0.4, 0.2, 0.7])), slab)
+    body = body_of(arm)._replace(pairs=np.zeros((0, 2), np.int64))
+    room = Room(0.04, 0.0, np.zeros((0, 7)), np.zeros((0, 3)))
+    free = 0
+    for q in rng.uniform(arm.q_min, arm.q_max, (150, 7)):
+        rho, _ = distances(arm.body.placed(q, arm.points), arm.points.radius, obstacles)
+        is_free = first_blocked(body, q[None], obstacles, room, 1.0) < 0
+        assert is_free == (rho.min() >= 0.04)
+        free += is_free
+    assert 20 < free < 130
+
+
 def seen(q: list[float], goal: Goal, *shapes: Shape, tick: int = 0, status: Status = Status.MOVING) -> Seen:
     used = len(shapes)
     o = around(*shapes)

@@ -15,6 +15,9 @@ from rtctl import design as cfg
 from rtctl.app import daemon
 from rtctl.app.plan import plan
 from rtctl.app.stream import REPLANS, ArmStatus, GoalStream
+from rtctl.arm.kinematics import chain_of
+from rtctl.arm.robot import Robot
+from rtctl.arm.search import Speeds, lasts
 from rtctl.arm.task import between
 from rtctl.cli import main
 from rtctl.cli.planning import message_of, obstacles_told
@@ -31,6 +34,7 @@ from rtctl.world import obstacle_table
 from rtctl.world.primitives import distances
 from tests.bodies import cloud_shape, ell, known, mesh_shape, torus
 from tests.lab import ROOT, changed, play, robot
+from tools.stress.certificate import duration
 
 TRAP = ROOT / "configs" / "scenarios" / "trap.toml"
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -138,6 +142,87 @@ def test_an_arm_folded_onto_itself_is_planned_for_from_where_it_is():
     for a, b in pairwise(np.array([folded, *(g.posture for g in goals)])):
         for part in np.linspace(0.0, 1.0, 10):
             assert arm.body.own_distances(a + part * (b - a), arm.own).min() >= arm.self_avoid.rho_min
+
+
+def tip_way(arm: Robot, path: F64) -> float:
+    """Return how long [m] the way of the tip is, by Pinocchio."""
+    data, frame = arm.body.model.createData(), arm.body.model.getFrameId("panda_hand_tcp")
+    tips = []
+    for a, b in pairwise(path):
+        for part in np.linspace(0.0, 1.0, 20):
+            pin.framesForwardKinematics(arm.body.model, data, a + part * (b - a))
+            tips.append(data.oMf[frame].translation.copy())
+    return float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum())
+
+
+SWUNG = np.array([-1.65, 1.32, 0.88, -0.52, -1.92, 3.6, 0.26])  # stretched out to one side
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_of_the_postures_of_a_goal_and_the_ways_there_a_quick_one_is_taken(seed: int):
+    """The tip goes less far than on the straight way of the joints to the posture it ends in; judged by Pinocchio."""
+    arm = robot()
+    goal = to(-0.245, 0.473, 0.345)
+    goals = plan(arm, SWUNG, goal, obstacle_table.empty(arm.slots).obstacles, seed)
+    path = np.array([SWUNG, *(g.posture for g in goals)])
+    straight = tip_way(arm, path[[0, -1]])
+    assert np.linalg.norm(goals[-1].position - goal.position) == 0.0
+    assert tip_way(arm, path) < 0.9 * straight
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_way_is_timed_by_its_slowest_joint_or_the_tip(turned: bool):
+    """The certificates of scenes time ways by other code; without corners they say the same, 1 / rate apart."""
+    arm, m = robot(), robot().motion
+    a = arm.home.copy()
+    b = a + (np.array([0, 0, 0, 0, 0, 0, 1.4]) if turned else np.array([0.5, 0.3, 0, 0.4, 0, 0.2, 0]))
+    speeds = Speeds(arm.qd_max, m.v_max, m.w_max, 4.0)
+    wanted = duration(arm, np.array([a, b])) - m.v_max / m.a_max
+    assert lasts(chain_of(arm.body), np.array([a, b]), speeds) == pytest.approx(wanted, rel=5e-3)
+    back = lasts(chain_of(arm.body), np.array([a, b, a]), speeds) - 2.0 * wanted
+    u = (b - a) / (wanted * arm.qd_max)
+    assert back == pytest.approx(0.5 * 2.0 * np.linalg.norm(u) / 4.0, rel=0.1)
+
+
+def test_an_arm_whose_points_reach_into_a_table_is_led_out_of_it():
+    """The balls that stand for its links overlap the table where it starts, the links do not; by coal all along."""
+    arm = robot()
+    start = np.array([0.0, 0.9, 0.0, -1.9, 0.0, 2.8, 0.785])
+    P = arm.body.placed(start, arm.points)
+    model, data = arm.body.model, arm.body.model.createData()
+    joints = {link: j for j, link in arm.body.link_of.items()}
+    hulls = [h for h in hulls_of(arm.body) if h.link > 2]
+    size = np.array([0.5, 0.5, 0.02])
+
+    def gap(q: F64, top: float) -> float:
+        pin.forwardKinematics(model, data, q)
+        slab = coal.Box(*(2.0 * size)), coal.Transform3s(EYE, np.array([0.6, 0.0, top - size[2]]))
+        return min(
+            coal.distance(
+                h.shape,
+                coal.Transform3s(data.oMi[joints[h.link]].rotation, data.oMi[joints[h.link]].translation),
+                *slab,
+                coal.DistanceRequest(),
+                coal.DistanceResult(),
+            )
+            for h in hulls
+        )
+
+    top = float((P[:, 2] - arm.points.radius)[arm.points.link > 2].min()) + 0.002
+    table = Shape(
+        "table", "box", np.array([*size, 0.0]), np.array([0.6, 0.0, top - size[2]]), UNIT, EYE[0] * 0, EYE[0] * 0
+    )
+    assert gap(start, top) > 0.002
+    obstacles = obstacle_table.with_static(obstacle_table.empty(arm.slots), (table,)).obstacles
+    goals = plan(arm, start, to(0.45, 0.2, top + 0.3), obstacles)
+    path = np.array([start, *(g.posture for g in goals)])
+    Q = [a + part * (b - a) for a, b in pairwise(path) for part in np.linspace(0.0, 1.0, 10)]
+    gaps = np.array([gap(q, top) for q in Q])
+    away = np.abs(np.array(Q) - start).max(axis=1)
+    assert gaps.min() > min(0.002, 0.9 * gap(start, top))
+    leaves = gap(start, top) - 0.005 + 0.1 * away  # the skin that is measured stands out by 5 mm at most
+    assert (gaps >= np.minimum(leaves, arm.avoid.rho_min) - 1e-4).all()
+    assert gaps[-1] > arm.avoid.rho_min
 
 
 def test_a_plan_to_a_direction_ends_in_a_posture_that_points_there():

@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
 EXTRAS = "sim,plan,report,rover,view"
-MODULES = "pinocchio, coal, numba, ompl, viser, foxglove, pymavlink, matplotlib, pyarrow, rtctl"
+MODULES = "pinocchio, coal, numba, viser, foxglove, pymavlink, matplotlib, pyarrow, rtctl"
 IMPORTS = f"import {MODULES}; print(rtctl.__version__)"
 FIRST = (
     ("-c", IMPORTS),

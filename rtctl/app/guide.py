@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtctl.app import plan
 from rtctl.app.postures import (
     Ending,
     Site,
@@ -26,11 +27,9 @@ from rtctl.app.postures import (
     swept,
 )
 from rtctl.app.way import Way, comes, heading, moves, progress, travelled, way_of, yielding
-from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
-from rtctl.arm.search import connected
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Advice, Goal, Shape, State, Status
@@ -87,10 +86,7 @@ def warm(robot: Robot) -> None:
     previewed(site, goal, robot.q_rest, inertia_of(site))
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
     heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
-    body, anchors = body_of(robot), robot.home[None]
-    room = Room(0.0, 0.0, anchors, np.zeros((1, 2)))
-    first_blocked(body, anchors, site.obstacles, room, 1.0)
-    connected(body, anchors, np.zeros((0, robot.n)), site.obstacles, room, 1.0, 1, np.zeros(2, np.int64))
+    plan.warm(site)
 
 
 class Guide:
@@ -242,19 +238,13 @@ class Guide:
         return next((advice for end in far if (advice := self._straight(site, end)) is not None), None)
 
     def _planned(self, m: Seen, goal: Goal, site: Site) -> Advice | None:
-        try:
-            from rtctl.app.plan import plan_joints  # heavy, few goals need it, and not everybody has installed it
-        except ImportError as error:
-            self.plans = False
-            self.events.append(("no_plan", f"the planner is not installed: {error}"))
-            return None
         if self.tries >= PLANS and not moves(site):
             return None
         self.tries += 1
         why = ""
         for times in SWEPT if moves(site) else SWEPT[-1:]:
             try:
-                path = plan_joints(swept(site, times), goal, self.seed + self.tries, within=np.inf)
+                path = plan.plan_joints(swept(site, times), goal, self.seed + self.tries, within=np.inf)
                 break
             except PlanError as error:
                 why = str(error)

@@ -1,41 +1,45 @@
 """The global planner: a far goal into a way of postures, or a stream of sub-goals for the goal interface.
 
-RRT-Connect over the joints: OMPL's where there is much room; where there is little, one that is compiled whole
-(`search`), since a narrow way takes many looks. A posture is free when every point subjected to the potential keeps a
-clearance from every obstacle, no two links come near, and no joint enters its limit zone. The clearance begins at the
-field's influence, so that a planned path feels no repulsion at all, and is relaxed in steps where there is no room for
-that; near the start and the goal it falls to what these have. Edges are tested by one compiled call each. Seeded: equal
-inputs give equal paths.
+RRT-Connect over the joints, compiled whole (`search`). A posture is free when every point subjected to the potential
+keeps a clearance from every obstacle, no two links come near, and no joint enters its limit zone. The clearance begins
+at the field's influence, so that a planned path feels no repulsion at all, and is relaxed in steps where there is no
+room for that; near the start and the goal it falls to what these have. Of the ways to several postures of the goal the
+quickest is taken, at the speeds that joints and tip may have. Seeded: equal inputs give equal paths.
 """
 
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from ompl import base, geometric, util
 
-from rtctl.app.postures import SEEDS, Ending, Site, along, endings, site_of, skin_of
-from rtctl.arm.freedom import Body, Room, body_of, first_blocked
+from rtctl.app.postures import SEEDS, SKIN, Ending, Site, endings, site_of, skin_of
+from rtctl.arm.freedom import SPARE, Body, Room, body_of, first_blocked
 from rtctl.arm.kinematics import clearance_of
 from rtctl.arm.model import Model
+from rtctl.arm.osc import JOINT_RATE, LEAD_TURN
 from rtctl.arm.robot import Robot
-from rtctl.arm.search import connected
+from rtctl.arm.search import Bounds, Speeds, connected, lasts, quicker
 from rtctl.arm.task import within as able
 from rtctl.design.report import WAY_ROOM
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
-from rtctl.types import F64, Goal, Task
+from rtctl.types import F64, I64, Goal, Task
 from rtctl.world.primitives import Obstacles
 
 ROOM = (1.0, 0.65, 0.4, 0.25, 0.0)  # fractions of influence and limit zone that a path keeps, tried in this order
+CHECKS = 1500  # postures looked at, times these in each of the steps
+LOOKS = (1.0, 1), (0.65, 2), (0.4, 2), (0.25, 4), (0.0, 4), (0.25, 40), (0.0, 40)  # first little work in each
 EDGE = 0.06  # [rad] between two checked postures of an edge
 FINE = 0.015  # [rad] between those of the finished path
-BETWEEN = 0.8  # fraction of the room that a finished path has between the postures of its edges
-HARDER = 6  # times as many starts, in the last of these steps
-CHECKS = 1500  # edges looked at, in the first of these steps
-LOOKS = {0.65: 10, 0.4: 10, 0.25: 40, 0.0: 40}  # times as many postures, in the others
+BETWEEN = 1.0 / WAY_ROOM  # fraction of the room that a finished path has between the postures of its edges
+HARDER = 6  # times as many starts for the goal's postures, where they are hard to find and in the last of these steps
+STRAIGHT = 3  # ends of straight paths that are made quicker
+OTHERS, SIDE = 6, 3000  # more paths looked for, and postures looked at for all of these
+HOPE = 0.9  # of the time of the straight way to an end, that a path to it may take
+ROUGH, DRAWS = 80, 800  # attempts to make a path quicker: of each, and of the best
+SHORTCUTS = 10  # postures looked at for each of these, at most
 AROUND = (0.5, 1.0, 2.0)  # [rad] around start and ends that samples are drawn from, in turn: joints that may turn
 # twice have a hundred times more room elsewhere
 REACH = 1.0  # [rad] towards a sample
@@ -45,7 +49,6 @@ THERE = 0.01  # [m] tolerance of a sub-goal, which is passed long before
 SPACING = 0.08  # [m] between sub-goals at most
 TURN = 0.35  # [rad] that a joint, and the hand, may turn between sub-goals
 CORRIDOR = 0.008  # [m] that the straight line between sub-goals may leave the planned path
-STRETCH = 1.0  # [rad] longest edge of the tree
 FAR = 10.0  # [m] of a clearance that nothing bounds
 
 
@@ -54,8 +57,8 @@ def plan(
 ) -> list[Goal]:
     """Return sub-goals that lead the arm from posture q (n,) [rad] to `goal`; the last one is `goal` itself.
 
-    Each carries the posture it was planned with. The same `seed` gives the same path; `checks` bounds the edges looked
-    at, a step of ROOM, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
+    Each carries the posture it was planned with. The same `seed` gives the same path; `checks` bounds the postures
+    looked at, a step of ROOM, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
     """
     task, why = able(goal.task, robot.axes)
     if why:
@@ -67,29 +70,47 @@ def plan(
 
 def plan_joints(site: Site, goal: Goal, seed: int, checks: int = CHECKS, within: float = WITHIN) -> F64:
     """Return the postures (k, n) [rad] of a path from the start to one that has the goal. Raises PlanError."""
-    rho, own = _nearness(site, site.start)
-    if min(rho, own) <= 0.0:
-        raise PlanError(f"plan: the arm is in contact where it starts, {min(rho, own):.3f} m")
-    rng = np.random.default_rng(seed)
-    end, why = time.monotonic() + within, ""
-    util.noOutputHandler()
-    for share in ROOM:
-        ends, why = _goal_postures(site, goal, share, seed, (1 if share else HARDER) * SEEDS)
-        free = _Free(site, share, ends)
-        for step in (EDGE, FINE) if ends else ():  # finer, where something was passed between two looks
-            path = _straight(site, ends, free, step)
-            if path is None and share in LOOKS:
-                path = _through(site, ends, free, rng, step, LOOKS[share] * checks * (1 if step == EDGE else 2))
-            elif path is None and step == EDGE:
-                path = _searched(site, ends, free, seed, partial(_spent, free, checks, end))
-            if path is None:
-                break
-            path = _shortened(path, free, rng, step)
-            if free.along(path, FINE, BETWEEN):
-                return path
+    *_, path = ways(site, goal, seed, checks, within)
+    return path
+
+
+def ways(site: Site, goal: Goal, seed: int, checks: int = CHECKS, within: float = WITHIN) -> Iterator[F64]:
+    """Yield a path as `plan_joints` returns, as soon as there is one, then a quicker one. Raises PlanError."""
+    warm(site)  # what is compiled now is not counted as time
+    _start_is_free(site)
+    rng, end = np.random.default_rng(seed), time.monotonic() + within
+    searches: dict[tuple[float, int], _Search | None] = {}
+    for step, (share, times) in enumerate(LOOKS):
+        hard = share == 0.0 and (step + 1 == len(LOOKS) or not any(searches.values()))
+        seeds = HARDER * SEEDS if hard else SEEDS
+        if (share, seeds) not in searches:
+            ends = _goal_postures(site, goal, share, seed, seeds)
+            searches[share, seeds] = _Search(site, share, ends, rng) if ends else None
+        search = searches[share, seeds]
+        way = search.first(times * checks) if search else None
+        if search and way is not None:
+            yield way
+            yield search.quicker(way)
+            return
         if time.monotonic() > end:
             raise PlanError(f"plan: no path to {_text(goal)} found in {within:g} s")
-    raise PlanError(why or f"plan: no path to {_text(goal)} found in {LOOKS[0.0] * checks} postures")
+    raise PlanError(
+        f"plan: no path to {_text(goal)} found in {LOOKS[-1][1] * checks} postures"
+        if any(searches.values())
+        else _why_none(site, goal, seed)
+    )
+
+
+def warm(site: Site) -> None:
+    """Run what is compiled once, upon nothing."""
+    robot, anchors = site.robot, site.start[None]
+    body, room = body_of(robot), Room(0.0, 0.0, anchors, np.zeros((1, 3)))
+    counts, bounds = np.zeros(2, np.int64), Bounds(robot.q_min, robot.q_max)
+    first_blocked(body, anchors, site.obstacles, room, 1.0)
+    connected(body, anchors, np.zeros((0, robot.n)), site.obstacles, room, 1.0, 1, counts)
+    tries, speeds = np.zeros((0, 3 + robot.n)), speeds_of(robot)
+    quicker(body, anchors, tries, site.obstacles, room, bounds, speeds, 1.0, counts)
+    lasts(site.chain, anchors, speeds)
 
 
 def sub_goals(robot: Robot, path: F64, goal: Goal) -> list[Goal]:
@@ -121,12 +142,30 @@ def _may_skip(poses: list[Model], fine: F64, a: int, b: int) -> bool:
 # -- what is free --------------------------------------------------------------------------------------------------
 
 
-def _nearness(site: Site, q: F64) -> tuple[float, float]:
-    """Return the least distance [m] of the arm to obstacles, and to itself, at q (n,)."""
+def _start_is_free(site: Site) -> None:
+    rho, own, links = _nearness(site, site.start)
+    if rho <= 0.0:  # the points stand out of the links, which may be clear all the same
+        rho = SKIN if links > -SKIN else links
+    if min(rho, own) <= 0.0:
+        raise PlanError(f"plan: the arm is in contact where it starts, {min(rho, own):.3f} m")
+
+
+def _nearness(site: Site, q: F64) -> tuple[float, float, float]:
+    """Return the least distance [m] of the arm to obstacles, and to itself, at q (n,), and of its skin to obstacles."""
     robot = site.robot
     own = robot.body.own_distances(q, robot.own)
-    rho = float(clearance_of(site.chain, robot.points, q[None], site.obstacles)[0])
-    return min(rho, FAR), min(float(own.min()), FAR) if len(own) else FAR
+    rho = float(clearance_of(site.chain, robot.points, q[None], site.obstacles, 1.1 * robot.avoid.rho0)[0])
+    links = FAR
+    if rho < SPARE * robot.avoid.rho_min:
+        links = float(clearance_of(site.chain, skin_of(robot.body), q[None], site.obstacles, robot.avoid.rho0)[0])
+    return min(rho, FAR), min(float(own.min()), FAR) if len(own) else FAR, links
+
+
+class Found(NamedTuple):
+    """A path that is free."""
+
+    path: F64  # (k, n) [rad]
+    takes: float  # [s], what its end lacks in room counted as well
 
 
 class _Free:
@@ -138,18 +177,19 @@ class _Free:
         anchors = np.array([q, *ends])
         self.low = np.minimum(r.q_min + zone, anchors.min(axis=0))
         self.high = np.maximum(r.q_max - zone, anchors.max(axis=0))
-        self.body: Body = body_of(r, None if share else skin_of(r.body))  # the last try looks at the links themselves
-        self.obstacles, self.asked = site.obstacles, 0
+        self.obstacles = site.obstacles
         self.room = Room(
             max(share * r.avoid.rho0, WAY_ROOM * r.avoid.rho_min),
-            max(share * r.self_avoid.rho0, r.self_avoid.rho_min),
+            max(share * r.self_avoid.rho0, WAY_ROOM * r.self_avoid.rho_min),
             anchors,
             np.array([_nearness(site, each) for each in anchors]),
         )
+        # the last try looks at the links themselves, and so do all where points may be nearer than the clearance
+        links = share == 0.0 or bool(self.room.near[:, 0].min() < SPARE * r.avoid.rho_min)
+        self.body: Body = body_of(r, skin_of(r.body) if links else None, share == 0.0)
 
     def all(self, Q: F64, share: float = 1.0) -> bool:
         """Return whether all postures (b, n) keep a share of the room, relaxed towards what start and ends have."""
-        self.asked += 1
         return first_blocked(self.body, Q, self.obstacles, self.room, share) < 0
 
     def along(self, path: F64, step: float, share: float = 1.0) -> bool:
@@ -160,99 +200,84 @@ class _Free:
 # -- the search ----------------------------------------------------------------------------------------------------
 
 
-def _straight(site: Site, ends: list[F64], free: _Free, step: float) -> F64 | None:
-    """Return the first straight edge (2, n) to an end that is free."""
-    return next((edge for q in ends if free.along(edge := np.array([site.start, q]), step)), None)
+class _Search:
+    """For one share of the room: the postures of the goal that keep it, and the paths to them."""
 
+    def __init__(self, site: Site, share: float, ends: list[Ending], rng: np.random.Generator) -> None:
+        """ends: one at least."""
+        self.site, self.ends, self.rng = site, [e.q for e in ends], rng
+        self.free, self.speeds = _Free(site, share, self.ends), speeds_of(site.robot)
+        self.lacks = {e.q.tobytes(): e.lacks for e in ends}
+        straight = [self._found(np.array([site.start, q])) for q in self.ends]
+        self.straight = sorted(straight, key=lambda each: each.takes)
 
-def _through(site: Site, ends: list[F64], free: _Free, rng: np.random.Generator, step: float, looks: int) -> F64 | None:
-    """Return a path (k, n) that the compiled search finds within so many postures looked at, a step [rad] apart."""
-    roots, n = np.array([site.start, *ends]), site.robot.n
-    around = np.resize(np.repeat(AROUND, 2), looks // 4)[:, None]  # each tree grows towards samples of each
-    low, high = np.maximum(free.low, roots.min(axis=0) - around), np.minimum(free.high, roots.max(axis=0) + around)
-    samples = low + rng.random((len(around), n)) * (high - low)
-    counts, reach = np.array([0, looks]), round(REACH / step)
-    path = connected(free.body, roots, samples, site.obstacles, free.room, step, reach, counts)
-    return path if len(path) else None
+    def first(self, looks: int) -> F64 | None:
+        """Return the first path (k, n), None where none is found in so many postures looked at.
 
-
-def _searched(site: Site, ends: list[F64], free: _Free, seed: int, stop: Callable[[], bool]) -> F64 | None:
-    """Return a path (k, n) of OMPL's RRT-Connect, None when that is stopped first."""
-    util.RNG.setSeed(seed + 1)  # before anything that draws is made
-    n = site.robot.n
-    space = _space(free)
-    info = base.SpaceInformation(space)
-    info.setStateValidityChecker(lambda state: free.all(_joints(state, n)[None]))
-    validator = _Edges(info, free, n)
-    info.setMotionValidator(validator)
-    info.setup()
-    problem = base.ProblemDefinition(info)
-    problem.addStartState(_state(space, site.start))
-    goals = base.GoalStates(info)
-    for q in ends:
-        goals.addState(_state(space, q))
-    problem.setGoal(goals)
-    planner = geometric.RRTConnect(info)
-    planner.setRange(STRETCH)
-    planner.setProblemDefinition(problem)
-    planner.setup()
-    planner.solve(base.PlannerTerminationCondition(stop))
-    if not problem.hasExactSolution():
+        Edges are looked at again more finely where something was passed between two looks.
+        """
+        for each in self.straight:
+            if self.free.along(each.path, EDGE) and self._usable(each.path):
+                return each.path
+        for step, times in ((EDGE, 1), (FINE, 2)):
+            path = self._through(self.ends, step, np.array([0, times * looks]))
+            if path is None or self._usable(path):
+                return path
         return None
-    states = problem.getSolutionPath().getStates()
-    return np.array([_joints(state, n) for state in states])
+
+    def quicker(self, first: F64) -> F64:
+        """Return the path (k, n) to one of the ends that takes least, within a bounded number of looks."""
+        counts, out = np.array([0, SIDE]), []
+        if len(first) == 2:
+            out = [each for each in self.straight if self.free.along(each.path, EDGE)][:STRAIGHT]
+        paths = [each.path for each in out] or [first]
+        out = sorted((self._found(self._cut(path, EDGE, ROUGH)) for path in paths), key=_takes)
+        for k in range(OTHERS):
+            hopeful = [each for each in self.straight if HOPE * each.takes < out[0].takes]
+            if not hopeful or counts[0] >= SIDE:
+                break
+            counts[1] = min(SIDE, counts[0] + SIDE // 4)
+            path = self._through([hopeful[k % len(hopeful)].path[-1]], EDGE, counts)
+            if path is not None:
+                out = sorted([*out, self._found(self._cut(path, EDGE, ROUGH))], key=_takes)
+        best = [self._cut(out[0].path, EDGE, DRAWS), *(each.path for each in out)]
+        return next((path for path in best if self._usable(path)), first)
+
+    def _found(self, path: F64) -> Found:
+        return Found(path, lasts(self.site.chain, path, self.speeds) + self.lacks[path[-1].tobytes()])
+
+    def _usable(self, path: F64) -> bool:
+        return self.free.along(path, FINE, BETWEEN)
+
+    def _through(self, ends: list[F64], step: float, counts: I64) -> F64 | None:
+        """Return a path (k, n) that the compiled search finds, None for none.
+
+        step: [rad] between two postures looked at; counts: (2,) how many there were, added to, and how many may be.
+        """
+        free, roots = self.free, np.array([self.site.start, *ends])
+        # each tree grows towards samples of each
+        around = np.resize(np.repeat(AROUND, 2), int(counts[1] - counts[0]) // 4)[:, None]
+        low, high = np.maximum(free.low, roots.min(axis=0) - around), np.minimum(free.high, roots.max(axis=0) + around)
+        samples = low + self.rng.random((len(around), self.site.robot.n)) * (high - low)
+        path = connected(free.body, roots, samples, free.obstacles, free.room, step, round(REACH / step), counts)
+        return path if len(path) else None
+
+    def _cut(self, path: F64, step: float, draws: int) -> F64:
+        """Return the path with pieces that are quicker taken where they are free."""
+        free, n = self.free, self.site.robot.n
+        tries = np.concatenate([self.rng.random((draws, 3)), self.rng.standard_normal((draws, n))], axis=1)
+        counts, bounds = np.array([0, SHORTCUTS * draws]), Bounds(free.low, free.high)
+        return quicker(free.body, path, tries, free.obstacles, free.room, bounds, self.speeds, step, counts)
 
 
-class _Edges(base.MotionValidator):  # type: ignore[misc]
-    """Tests an edge of the tree by one compiled call."""
-
-    def __init__(self, info: base.SpaceInformation, free: _Free, n: int) -> None:
-        super().__init__(info)
-        self.free, self.n = free, n
-
-    def checkMotion(self, a: base.State, b: base.State) -> bool:
-        """Return whether the straight line between two states is free."""
-        return self.free.all(along(_joints(a, self.n), _joints(b, self.n), EDGE))
+def _takes(found: Found) -> float:
+    return found.takes
 
 
-def _spent(free: _Free, checks: int, end: float) -> bool:
-    return free.asked > checks or time.monotonic() > end
-
-
-def _joints(state: base.State, n: int) -> F64:
-    return np.array([state[i] for i in range(n)])
-
-
-def _space(free: _Free) -> base.RealVectorStateSpace:
-    n = len(free.low)
-    space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
-    for i in range(n):
-        bounds.setLow(i, float(free.low[i]) - 1e-9)
-        bounds.setHigh(i, float(free.high[i]) + 1e-9)
-    space.setBounds(bounds)
-    space.setLongestValidSegmentFraction(EDGE / space.getMaximumExtent())
-    return space
-
-
-def _state(space: base.RealVectorStateSpace, q: F64) -> base.State:
-    state = space.allocState()
-    for i, value in enumerate(q):
-        state[i] = float(value)
-    return state
-
-
-def _shortened(path: F64, free: _Free, rng: np.random.Generator, step: float, tries: int = 150) -> F64:
-    """Return the path with random shortcuts taken where they are free."""
-    for _ in range(tries):
-        fine = _resampled(path, 2.0 * EDGE)
-        if len(fine) < 3:
-            break
-        a, b = sorted(rng.integers(0, len(fine), 2).tolist())
-        if b - a < 2:
-            continue
-        if free.all(along(fine[a], fine[b], step)):
-            path = np.concatenate([fine[: a + 1], fine[b:]])
-    return path
+def speeds_of(robot: Robot) -> Speeds:
+    """Return how fast a robot goes along a way."""
+    m = robot.motion
+    return Speeds(m.speed_margin * robot.qd_max, m.v_max, LEAD_TURN * m.w_max, JOINT_RATE)
 
 
 def _resampled(path: F64, step: float) -> F64:
@@ -267,19 +292,21 @@ def _resampled(path: F64, step: float) -> F64:
 # -- postures that have the goal -------------------------------------------------------------------------------------
 
 
-def _goal_postures(site: Site, goal: Goal, share: float, seed: int, seeds: int) -> tuple[list[F64], str]:
-    """Return free postures that have the goal, the best first, and why there are none ('' when there are).
+def _goal_postures(site: Site, goal: Goal, share: float, seed: int, seeds: int) -> list[Ending]:
+    """Return free postures that have the goal, the best first.
 
     Those with a clearance to spare come alone, where there are some.
     """
-    found: list[Ending] = endings(site, goal, seed, share, seeds)
-    if not found:
-        nothing = site.obstacles._replace(active=np.zeros_like(site.obstacles.active))
-        if endings(site._replace(obstacles=nothing), goal, seed, 0.0):
-            return [], f"plan: every posture found that has the goal {_text(goal)} touches something"
-        return [], f"plan: no posture within the joint limits was found that has the goal {_text(goal)}"
-    fine = [e.q for e in found if e.rho >= NEAREST * site.robot.avoid.rho_min]
-    return fine or [e.q for e in found], ""
+    found = endings(site, goal, seed, share, seeds)
+    return [e for e in found if e.rho >= NEAREST * site.robot.avoid.rho_min] or found
+
+
+def _why_none(site: Site, goal: Goal, seed: int) -> str:
+    """Return why no posture was found that has the goal."""
+    nothing = site.obstacles._replace(active=np.zeros_like(site.obstacles.active))
+    if endings(site._replace(obstacles=nothing), goal, seed, 0.0):
+        return f"plan: every posture found that has the goal {_text(goal)} touches something"
+    return f"plan: no posture within the joint limits was found that has the goal {_text(goal)}"
 
 
 def _evaluated(robot: Robot, q: F64) -> Model:

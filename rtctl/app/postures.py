@@ -46,6 +46,7 @@ class Ending(NamedTuple):
     rho: float  # [m] from the points to obstacles, as the config's influence and clearance count it
     clear: bool  # the links keep the clearance from them
     cost: float  # [s]
+    lacks: float = 0.0  # [s] of that, what it lacks in room
 
 
 def packed(obstacles: Obstacles) -> Obstacles:
@@ -90,7 +91,7 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
     starts = np.concatenate([[site.start, robot.q_rest, robot.home], rng.uniform(low, high, (seeds, robot.n))])
     found, has = postures_of(site.chain, starts, target_of(goal), low, high)
     found = _unwound(site, found[has], low, high)
-    rho = clearance_of(site.chain, robot.points, found, site.obstacles)
+    rho = clearance_of(site.chain, robot.points, found, site.obstacles, 1.1 * robot.avoid.rho0)  # farther is as good
     out: list[Ending] = []
     for k in np.argsort([_cost(site, q, r) for q, r in zip(found, rho, strict=True)], kind="stable"):
         q = found[k]
@@ -101,7 +102,8 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
         own = robot.body.own_distances(q, robot.own)
         if not len(own) or own.min() >= robot.self_avoid.rho_min:
             clear = bool(links_clear(site, q[None], rho[k : k + 1])[0])
-            out.append(Ending(q, float(rho[k]), clear, _cost(site, q, float(rho[k]))))
+            cost = _cost(site, q, float(rho[k]))
+            out.append(Ending(q, float(rho[k]), clear, cost, cost - _away(site, q)))
     return out
 
 
@@ -127,11 +129,15 @@ def links_clear(site: Site, Q: F64, rho: F64) -> B1:
 def _cost(site: Site, q: F64, rho: float) -> float:
     """Return the time [s] to a posture, and what its lack of room counts."""
     robot = site.robot
-    away = float((np.abs(q - site.start) / robot.qd_max).max())
     room = min(max(rho, 0.0) / robot.avoid.rho0, 1.0)
     touching = 100.0 if rho <= 0.0 else 0.0
     margin = np.minimum(q - robot.q_min, robot.q_max - q) / robot.limit.rho0
-    return away + TIGHT * (1.0 - room) + TIGHT * (1.0 - min(float(margin.min()), 1.0)) + touching
+    return _away(site, q) + TIGHT * (1.0 - room) + TIGHT * (1.0 - min(float(margin.min()), 1.0)) + touching
+
+
+def _away(site: Site, q: F64) -> float:
+    """Return the time [s] straight to a posture."""
+    return float((np.abs(q - site.start) / site.robot.qd_max).max())
 
 
 def _unwound(site: Site, Q: F64, low: F64, high: F64) -> F64:
