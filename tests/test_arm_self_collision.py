@@ -11,12 +11,13 @@ from rtctl.arm.apart import hulls_apart
 from rtctl.arm.field import CAPPED, CONTACT, field_params, own_field
 from rtctl.arm.model import RigidBody
 from rtctl.arm.self_collision import Own, nothing
+from rtctl.design import pairs
 from rtctl.design.pairs import hulls_of, watched
 from rtctl.types import F64
 from tests.arms import NO_POINTS, PANDA_HOME, panda
 
-INFLUENCE, REACH = 0.02, 0.04
-PARAMS = field_params(0.5, INFLUENCE, 0.008, 1e-3, 1.0, 0.0, 50.0)
+INFLUENCE, CLEARANCE, REACH = 0.02, 0.008, 0.04
+PARAMS = field_params(0.5, INFLUENCE, CLEARANCE, 1e-3, 1.0, 0.0, 50.0)
 UNDAMPED = PARAMS._replace(k_d=0.0)
 NO_ENDS = np.zeros(0)  # no posture of a goal
 
@@ -24,7 +25,7 @@ NO_ENDS = np.zeros(0)  # no posture of a goal
 @cache
 def own() -> Own:
     limits = panda().limits
-    return watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, INFLUENCE, REACH)
+    return watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, CLEARANCE, REACH)
 
 
 def postures(count: int, seed: int = 2) -> F64:
@@ -122,6 +123,32 @@ def test_neighbours_and_links_that_never_meet_are_not_watched() -> None:
     assert not {("panda_hand", "panda_link5"), ("panda_link7", "panda_link5")} & names
     assert not {("panda_link2", "panda_link1"), ("panda_link5", "panda_link3"), ("panda_link4", "panda_link2")} & names
     assert {("panda_hand", "panda_link0"), ("panda_hand", "panda_link2"), ("panda_link5", "panda_link0")} <= names
+
+
+def test_links_that_meet_in_few_postures_are_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    every, limits, link = own(), panda().limits, {h.name: h.link for h in hulls_of(panda())}
+    monkeypatch.setattr(pairs, "POSTURES", 40)  # as if what a pair meets in were fifty times as rare
+    few = watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, CLEARANCE, REACH)
+    meet = {
+        names
+        for q in postures(600, seed=9)
+        for names, rho in zip(every.names, panda().own_distances(q, every), strict=True)
+        if rho < CLEARANCE and link[names[0]] - link[names[1]] > 2  # what two joints move is soon seen
+    }
+    assert len(meet) > 10
+    assert meet <= set(few.names)
+
+
+def test_links_that_are_near_at_home_are_watched() -> None:
+    limits = panda().limits
+    hand, arm = "panda_hand", "panda_link2"
+    near = next(
+        q
+        for q in postures(20000, seed=4)
+        for names, rho in zip(own().names, panda().own_distances(q, own()), strict=True)
+        if names == (hand, arm) and CLEARANCE < rho < INFLUENCE
+    )
+    assert (hand, arm) in watched(panda(), limits.q_min, limits.q_max, near, CLEARANCE, REACH).names
 
 
 def test_the_bounding_balls_hold_their_hulls() -> None:

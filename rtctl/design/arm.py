@@ -311,7 +311,7 @@ def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[
     if config.avoid.self_collision:
         # beyond the influence by what stops a link before it, and a little, that none comes there between evaluations
         reach = config.avoid.self_influence_m + 0.02 + rules.braking_distance(config)
-        own = watched(body, q_min, q_max, home, config.avoid.self_influence_m, reach)
+        own = watched(body, q_min, q_max, home, config.avoid.self_clearance_m, reach)
     else:
         own = nothing()
     return points, coverage, own

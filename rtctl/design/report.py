@@ -231,11 +231,17 @@ def _points(c: Config, r: Robot) -> list[Row]:
         _row("protrusion", cover.protrusion, "m", f"of a link beyond its points; clearance {r.avoid.rho_min:g}", fine),
         _row("overhang", cover.overhang, "m", "of the points beyond the links"),
         _row("gap", _gap(r), "m", "wider than a link: a planned way surely passes (overhang_m)"),
-        _row(
-            "self-collision pairs",
-            len(r.own.pairs),
-            "",
-            "watched" if c.avoid.self_collision else "switched off",
-            c.avoid.self_collision,
-        ),
+        _self_collision(c, r),
     ]
+
+
+def _self_collision(c: Config, r: Robot) -> Row:
+    """How many pairs of links are watched, and whether some are so near at home that they push each other there."""
+    apart = r.body.own_distances(r.home, r.own)
+    k = int(apart.argmin()) if len(apart) else -1
+    note, fine = "watched" if c.avoid.self_collision else "switched off", c.avoid.self_collision
+    if k >= 0 and apart[k] < r.self_avoid.rho0:
+        far, near = r.own.names[k]
+        note += f"; {far} and {near} are {apart[k]:.3g} m apart at home: they push each other there"
+        fine = False
+    return _row("self-collision pairs", len(r.own.pairs), "", note, fine)
