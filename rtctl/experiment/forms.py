@@ -56,6 +56,7 @@ def run(
     for k, (superposition, inertia) in enumerate(forms):
         say((k + 0.5) / (len(forms) + 0.5))
         keys: dict[str, object] = {"superposition": superposition, "inertia": inertia}
+        keys |= {"posture": "never", "plan": "never"}  # the field's own way, not one round what it will meet
         traces[f"{superposition}, {inertia}"] = played(scenario, path, unsaid, {"avoid": keys})
     return Data(size[:, 2] / size[:, 0], angle, size[:, 1] / size[:, 0], traces)
 
