@@ -28,9 +28,9 @@ from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, I64, Goal, Task
 from rtctl.world.primitives import Obstacles
 
-ROOM = (1.0, 0.65, 0.4, 0.25, 0.0)  # fractions of influence and limit zone that a path keeps, tried in this order
-CHECKS = 1500  # postures looked at, times these in each of the steps
-LOOKS = (1.0, 1), (0.65, 2), (0.4, 2), (0.25, 4), (0.0, 4), (0.25, 40), (0.0, 40)  # first little work in each
+CHECKS = 1500  # postures looked at, times those of LOOKS
+# Fractions of influence and limit zone that a path keeps, in the order tried, and how long: first little work in each.
+LOOKS = ((1.0, 1), (0.65, 2), (0.4, 2), (0.25, 4), (0.0, 4), (0.25, 40), (0.0, 40))
 EDGE = 0.06  # [rad] between two checked postures of an edge
 FINE = 0.015  # [rad] between those of the finished path
 BETWEEN = 1.0 / WAY_ROOM  # fraction of the room that a finished path has between the postures of its edges
@@ -58,7 +58,7 @@ def plan(
     """Return sub-goals that lead the arm from posture q (n,) [rad] to `goal`; the last one is `goal` itself.
 
     Each carries the posture it was planned with. The same `seed` gives the same path; `checks` bounds the postures
-    looked at, a step of ROOM, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
+    looked at, for a step of LOOKS, and `within` [s] the time, whichever comes first. Raises PlanError, which says why.
     """
     task, why = able(goal.task, robot.axes)
     if why:
