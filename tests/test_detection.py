@@ -35,6 +35,13 @@ def test_a_motor_that_gives_half_its_torque_stops_the_arm_though_the_slew_follow
     assert 0.0 < after < 0.02
 
 
+def test_a_drive_that_reports_a_fault_is_not_said_to_lie_about_its_torque_too():
+    seen, after, _, _ = broken("drive_fault@1.0:2", 0.5)
+    assert "drive_fault" in seen
+    assert "torque_mismatch" not in seen
+    assert 0.0 <= after < 0.005
+
+
 def test_an_echo_is_judged_against_the_last_four_commands_and_no_older_one():
     with lab() as here:
         here.running()

@@ -100,7 +100,7 @@ DISTRUST = sum(  # bits of the faults after which a torque that follows from the
     1 << i for i, fault in enumerate(FAULTS) if {"position", "speed", "torque"} & set(fault.untrue)
 )
 ASTRAY = DISTRUST | BIT["contact"] | BIT["outside_limits"]  # while it stops: it does not go as it should
-_DISABLED, _TORQUE, _JUMPS = detection.DISABLED, detection.TORQUE, (1 << JUMP_WINDOW) - 1
+_DISABLED, _TORQUE, _FAULT, _JUMPS = detection.DISABLED, detection.TORQUE, detection.FAULT, (1 << JUMP_WINDOW) - 1
 _CORRUPT, _SEND_FAILED, _DERATED = (
     int(Link.CORRUPT),
     int(Link.SEND_FAILED),
@@ -240,12 +240,13 @@ def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Count
     """Return the counters after a tick; link: types.Link of it."""
     flags, active = e.flags, e.active
     corrupt = 1 if link & _CORRUPT else 0
+    gives = active and flags & _FAULT == 0  # a drive that reports a fault gives no torque, and has said so
     return Counters(
         ((c.corrupt_window << 1) | corrupt) & 0x3FF,
         _grown(c.send_failed, link & _SEND_FAILED != 0),
         _grown(c.disabled, active and flags & _DISABLED != 0),
-        _grown(c.mismatch, active and flags & _TORQUE != 0),
-        _grown(c.slew_follows_echo, active and e.slew_follows_echo and link & _DERATED == 0),
+        _grown(c.mismatch, gives and flags & _TORQUE != 0),
+        _grown(c.slew_follows_echo, gives and e.slew_follows_echo and link & _DERATED == 0),
         ((c.jumps << 1) | (1 if e.implausible else 0)) & _JUMPS if active else 0,
         _grown(c.missed, e.missed != 0),
         _grown(c.innovation, active and not e.innovation <= innovation_max),
