@@ -239,6 +239,29 @@ def test_the_preview_ends_where_the_arm_does_light_joints_first(step: tuple[floa
     assert errors[0] < 0.25 < errors[1]  # [rad]
 
 
+def test_a_goal_on_whose_way_light_joints_run_into_their_limits_gets_a_posture():
+    to = np.array([0.194, -0.127, 0.216])
+    with lab() as here:  # the law alone, by the plant's truth
+        here.running()
+        begin = here.memory.joints.q.copy()
+        here.ask(to)
+        given, arm = here.memory.goal, here.robot
+        here.run(2.5)
+        ended = here.simulator.truth().q
+    assert given is not None
+
+    def zones(q: np.ndarray) -> float:
+        return float((np.minimum(q - arm.q_min, arm.q_max - q) / arm.limit.rho0).min())
+
+    assert zones(ended) < 0.7
+    guide = Guide(arm, False)
+    guide.begin()
+    advice = guide.advise(seen(list(begin), given))
+    assert advice is not None
+    assert advice.posture is not None
+    assert zones(advice.posture) >= 1.0
+
+
 def test_a_way_is_left_to_what_will_cross_it_and_taken_again():
     guide = Guide(robot(), plans=True, at_once=True)
     guide.begin()
