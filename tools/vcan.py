@@ -30,6 +30,7 @@ from types import FrameType
 from typing import Literal, NamedTuple
 
 from rtctl.kernel.cache import folder as kernel_folder
+from rtctl.kernel.cache import stamp
 from tools.child import Sink, exit_status, guarded, pipe, pump, writer
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -200,7 +201,11 @@ def _init_script(
     """Process 1 of the guest: mounts, modules, vcan0, the command, its status on the third serial line, power off."""
     inside = dict(env) | {"TMPDIR": "/run/tmp", "XDG_RUNTIME_DIR": "/run/user"}
     exports = [f"export {k}={shlex.quote(v)}" for k, v in inside.items() if re.fullmatch(r"[A-Za-z_]\w*", k)]
-    binds = [shlex.join(["mount", "--bind", f"/run/copies{path}", str(path)]) for path in copies]
+    binds = [
+        f"mkdir -p {shlex.quote(f'/run/copies{path}')} && "
+        + shlex.join(["mount", "--bind", f"/run/copies{path}", str(path)])
+        for path in copies
+    ]
     return "\n".join(
         [
             "#!/bin/sh",
@@ -266,13 +271,26 @@ def _pack(scratch: Path, env: Mapping[str, str]) -> list[Path]:
     hostfs cuts modification times to whole seconds, so numba's on-disk cache would take every file for a changed one
     and, worse, rewrite the host's cache so. A tar archive keeps the nanoseconds.
     """
-    wanted = [ROOT / "rtctl", ROOT / "firmware_sim", kernel_folder().resolve()]
-    paths = sorted({path for path in wanted if path.is_dir()})
-    names = [str(path.relative_to("/")) for path in paths]
+    kernels = kernel_folder().resolve()
+    sources = [ROOT / "rtctl", ROOT / "firmware_sim"]
+    names = [str(path.relative_to("/")) for path in (*sources, *_present(kernels))]
     archive = ["tar", "--format=pax", "--warning=none", "-C", "/", "-cf", str(scratch / "copies.tar"), *names]
     if subprocess.run(archive, check=False).returncode > 1:  # 1: a file changed while it was read
         raise VcanError(f"could not pack {', '.join(names)} for the guest")
-    return paths
+    return [*sources, kernels]
+
+
+def _present(kernels: Path) -> list[Path]:
+    """What the present sources look for in a cache: one of many versions is larger than a guest's memory."""
+    found = []
+    for entry in sorted(kernels.iterdir()):
+        source = ROOT.joinpath(*entry.name.split(".")).with_suffix(".py")
+        if source.is_file():
+            ours = stamp(entry.name, str(source))
+            found += [version for version in entry.iterdir() if ours.startswith(version.name)]
+        elif "." not in entry.name:  # of no module: spheres, marks, and the drives' own
+            found.append(entry)
+    return found
 
 
 def _memory_directory(memory: str, scratch: Path) -> str:

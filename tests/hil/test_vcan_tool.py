@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rtctl.kernel.cache import stamp
 from tools import vcan
 
 ROOT = Path(vcan.__file__).resolve().parent.parent
@@ -77,6 +78,15 @@ def test_nothing_outlives_a_caller_that_is_killed() -> None:
         assert processes(token)
         caller.send_signal(signal.SIGKILL)
     assert left(token) == []
+
+
+def test_a_guest_is_given_the_kernels_of_these_sources_alone(tmp_path: Path) -> None:
+    """A cache that many versions filled was larger than a guest's memory, and the guest died of it."""
+    source = ROOT / "rtctl/arm/law.py"
+    present = tmp_path / "rtctl.arm.law" / stamp("rtctl.arm.law", str(source))[:16]
+    for folder in (present, present.with_name("0" * 16), tmp_path / "rtctl.gone" / present.name, tmp_path / "points"):
+        folder.mkdir(parents=True)
+    assert vcan._present(tmp_path) == [tmp_path / "points", present]
 
 
 def test_where_it_cannot_run_it_names_the_command_that_helps() -> None:
