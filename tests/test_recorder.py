@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from rtctl.log import Header, Kind, make_header, read, segments
 from rtctl.log.entry import Batch
 from rtctl.log.mcap.recovery import recover_folder
 from rtctl.log.read.info import info
+from rtctl.log.record import ring
 from rtctl.log.record.recorder import Recorder, rescue
 from rtctl.log.record.writer import Options, Session, segment_path
 
@@ -107,6 +109,28 @@ def test_log_time_is_the_wall_clock_at_one_offset_from_the_monotonic_clock(start
     assert before - 10_000_000 < log["/event"].time[0] < after + 10_000_000
 
 
+def test_a_recorder_that_gets_on_is_waited_for_however_slow_the_machine_is(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = start()
+    put_ticks(recorder, range(50))
+    counts, waiting, now = recorder._ring.counts, list(range(1, 41)), [0.0]
+
+    def slow() -> ring.Counts:
+        return counts()._replace(backlog=waiting.pop(), finished=False) if waiting else counts()
+
+    def clock() -> float:
+        now[0] += 3.0 if waiting else 0.0  # from each look to the next
+        return now[0]
+
+    monkeypatch.setattr(recorder._ring, "counts", slow)
+    told = SimpleNamespace(monotonic=clock, monotonic_ns=time.monotonic_ns, sleep=time.sleep)
+    monkeypatch.setattr("rtctl.log.record.recorder.time", told)
+    stats = recorder.close()
+    assert not waiting
+    assert stats.path.exists()
+
+
 def test_signals_meant_for_the_group_do_not_end_the_recorder(start: Start, tmp_path: Path) -> None:
     recorder = start()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -171,6 +195,7 @@ import sys, os, time
 sys.path[:0] = sys.argv[2:]
 import test_recorder as t
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 recorder = t.Recorder.start(Path(sys.argv[1]) / "log", t.HEADER, folders=[Path(sys.argv[1])])
 os.write(1, recorder.pid.to_bytes(8, "little"))

@@ -17,7 +17,7 @@ from rtctl import design as cfg
 from rtctl.errors import RtctlError
 
 START_S = 600.0  # [s] for a process to be ready: the first ever compiles every kernel
-END_S = 60.0  # [s] for a process to end
+END_S = 300.0  # [s] for a process to end: the controller waits for its log
 POLL = 0.05  # [s] between two looks at the controller
 
 

@@ -249,9 +249,10 @@ def _review(servo: Servo[R, M, F, C], recorder: Recorder) -> None:
 
 def _summary(servo: Servo[R, M, F, C], log: Path, dropped: int) -> str:
     m, seen = servo.memory, ", ".join(servo.vehicle.names(servo.faults_seen)) or "none"
+    late = "" if log.exists() else "; the recorder is still writing it"
     return (
         f"rtctl: {m.state.name} after {m.tick + 1} ticks, {servo.missed} slots missed, faults: {seen}, "
-        f"log {log} ({dropped} entries dropped)"
+        f"log {log} ({dropped} entries dropped){late}"
     )
 
 

@@ -142,17 +142,19 @@ class Recorder:
         degraded = counts.degraded or losing or not alive
         return Stats(counts.number, counts.dropped, counts.lost, counts.backlog, alive, degraded, path)
 
-    def close(self, reason: str = "closed", detail: str = "", timeout: float = 10.0) -> Stats:
+    def close(self, reason: str = "closed", detail: str = "", patience: float = 10.0) -> Stats:
         """Say why the log ends, and wait until it is whole; a recorder that died is started again for that.
 
-        After `timeout` [s] the recorder finishes by itself.
+        A recorder that gets on is waited for. After `patience` [s] in which it did not, it is left to finish by itself.
         """
         text = json.dumps({"reason": reason, "detail": detail}).encode()
         self._ring.put(Kind.SENTINEL, text, time.monotonic_ns())
         self._ring.finish()
-        until = time.monotonic() + timeout
+        until, waiting = time.monotonic() + patience, self._ring.counts().backlog
         attempts = 3
         while not self._ring.counts().finished and time.monotonic() < until and (self.alive or attempts > 0):
+            if (now := self._ring.counts().backlog) < waiting:  # the machine may be busy
+                until, waiting = time.monotonic() + patience, now
             attempts -= not self.alive
             self.spawn()
             time.sleep(0.005)
