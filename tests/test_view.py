@@ -156,6 +156,34 @@ def test_back_and_forth_in_a_log_gives_the_same(record: Recorded) -> None:
     assert first[2]["ball"] != later[2]["ball"]
 
 
+def test_a_page_that_rests_tells_and_sends_nothing_again(record: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands still would cost as much as what moves; a log that is paused was told anew with each frame."""
+    page = Page(record, Operator(None), "127.0.0.1", 0)
+    stage = page._stage
+    try:
+        record.seek(1.2)
+        record.step()
+        story, sent = record.story, list[object]()
+        assert story.moment is not None
+        now = story.moment.time
+        monkeypatch.setattr(page._server.scene, "_queue_scene_message", sent.append)
+        stage.draw(story)
+        assert sent
+        sent.clear()
+        record.step()
+        assert record.story is story
+        stage.draw(story)
+        assert [type(message).__name__ for message in sent if "Set" in type(message).__name__] == []
+        ball = stage._things["ball"].frame
+        place, told = ball.position.copy(), story.things
+        stage._obstacles({name: thing for name, thing in told.items() if name != "ball"}, now)
+        stage._obstacles(told, now)
+        assert stage._things["ball"].frame is not ball
+        assert stage._things["ball"].frame.position == pytest.approx(place, abs=1e-4)
+    finally:
+        page.close()
+
+
 def test_the_story_before_a_look_comes_from_the_console() -> None:
     header = make_header("arm", ["a"], 8, 0.001)
     world = {

@@ -236,7 +236,7 @@ class Recorded:
         """Go on, or back, to where the page is."""
         row = max(0, int(np.searchsorted(self.times, self.at, "right")) - 1)
         first = self._row
-        if row < self._row or (row - self._row) > CHART * DRAWN:
+        if row + 1 < self._row or (row - self._row) > CHART * DRAWN:
             self.story, self._next = Story(self._header), 0
             first = max(0, row + 1 - round(CHART * DRAWN))
         for k in range(first, row + 1):

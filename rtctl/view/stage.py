@@ -1,6 +1,7 @@
 """The 3D part of a page: robot, obstacles, forces, goal, ways."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ GOAL, AHEAD, BEHIND, FORCE, SPHERE, SEEN = (
 NEWTON = 0.004  # [m] length of an arrow for 1 N
 LONGEST, SHORTEST = 0.5, 0.03  # [m] of an arrow
 FLOOR = 2.0, 200.0  # [m] half of an arm's, a base's
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+DIGITS = 5  # of a pose that is seen: 10 um
 SLOW = 6  # frames from one drawing of ways and map to the next
 FROM = np.array([0.66, -0.61, 0.44]) / np.linalg.norm([0.66, -0.61, 0.44])  # whence a camera looks at first
 ABOVE = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])  # the same for a base
@@ -67,6 +70,7 @@ class Stage:
         self._parts: list[tuple[SceneNodeHandle, int, F64]] = []
         self._spheres: list[tuple[SceneNodeHandle, int, F64]] = []
         self._arrows: SceneNodeHandle | None = None
+        self._poses: dict[str, tuple[float, ...]] = {}  # where nodes were put, by name
         self._frame = 0
         self._place: F64 = np.zeros(3)  # [m] of the moment that is drawn
         self._goal_now: F64 | None = None
@@ -164,23 +168,29 @@ class Stage:
         if self.body is not None and len(m.q):
             self.body.move(m.q)
             for part, joint, X in (*self._parts, *(self._spheres if self.shown.spheres else ())):
-                part.position, part.wxyz = self.body.pose(joint, X)
+                self._put(part, *self.body.pose(joint, X))
         elif self.reader.is_base:
-            self._base.position = m.place
-            self._base.wxyz = (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading))
+            self._put(self._base, m.place, (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading)))
         moved = m.goal is not None and (self._goal_now is None or float(np.linalg.norm(m.goal - self._goal_now)) > 1.0)
         self._place, self._goal_now = m.place, m.goal
         if moved and self.reader.is_base:  # a new goal: the whole trip is shown
             for client in self._server.get_clients().values():
                 self.face(client)
-        self._tip.position = m.place
+        self._put(self._tip, m.place)
         self._goal.visible = m.goal is not None
         if m.goal is not None:
-            self._goal.position = m.goal
+            self._put(self._goal, m.goal)
         self._obstacles(story.things, m.time)
         self._forces(m)
         if self._frame % SLOW == 1:
             self._ways(story, m)
+
+    def _put(self, node: SceneNodeHandle, place: F64, wxyz: Sequence[float] | F64 = UPRIGHT) -> None:
+        """Put a node somewhere, place (3,) [m], unless nobody would see it move: each time costs a message."""
+        now = (*(round(float(v), DIGITS) for v in (*place, *wxyz)),)
+        if self._poses.get(node.name) != now:
+            self._poses[node.name] = now
+            node.position, node.wxyz = place, np.asarray(wxyz)
 
     def _obstacles(self, things: dict[str, tuple[Thing, bool]], now: float) -> None:
         for name in [name for name in self._things if name not in things]:
@@ -194,11 +204,12 @@ class Stage:
                 have = self._things[name] = self._thing(name, thing, is_fixed)
             elapsed = max(0.0, now - thing.time)
             velocity, omega = np.array(told["velocity"], np.float64), np.array(told["omega"], np.float64)
-            have.frame.position = np.array(told["position"], np.float64) + elapsed * velocity
-            have.frame.wxyz = _turned(told["wxyz"], omega * elapsed)
+            place = np.array(told["position"], np.float64) + elapsed * velocity
+            self._put(have.frame, place, _turned(told["wxyz"], omega * elapsed))
 
     def _thing(self, name: str, thing: Thing, is_fixed: bool) -> _Thing:
         frame = self.scene.add_frame(f"/obstacles/{name}", show_axes=False)
+        self._poses.pop(frame.name, None)  # one of this name may have stood elsewhere
         reach = float(thing.shape.get("influence") or self.reader.influence)
         body, shell = triangles(thing.shape, thing.boxes), triangles(thing.shape, thing.boxes, reach)
         colour = OWN if is_fixed else TOLD
