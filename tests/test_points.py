@@ -17,6 +17,7 @@ from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
 from rtctl.design import kept
 from rtctl.design.points import coverage, given, place
+from rtctl.design.solids import solids_of
 from rtctl.errors import ConfigError
 from rtctl.types import F64
 from tests.arms import CROOKED, CROOKED_JOINTS, crooked, panda, states
@@ -282,6 +283,26 @@ def test_a_file_of_which_one_digit_is_another_is_made_anew(tmp_path: Path) -> No
     first = text.index('"radius": [0.') + len('"radius": [0.')
     path.write_text(text[:first] + "0" + text[first:])  # a tenth
     assert same(place(body, 0.04), made)
+
+
+def test_hulls_are_kept_to_the_bit_and_made_anew_where_their_file_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = crooked(tmp_path)
+    made = solids_of(body)
+    (path,) = (tmp_path / "hulls").iterdir()
+    with monkeypatch.context() as patch:
+        patch.setattr("scipy.spatial.ConvexHull", None)
+        for before, now in zip(made, solids_of(body), strict=True):
+            assert before[:2] == now[:2]
+            assert all(
+                a.dtype == b.dtype and a.tobytes() == b.tobytes() for a, b in zip(before[2:], now[2:], strict=True)
+            )
+        path.write_text(path.read_text()[:-9])
+        with pytest.raises(TypeError):
+            solids_of(body)
+    assert len(solids_of(body)) == len(made)
+    assert kept.known(path) is not None
 
 
 def test_where_nothing_can_be_written_spheres_are_placed_all_the_same(

@@ -8,7 +8,6 @@ corners do, so the cover is complete by proof and not by sampling.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
@@ -31,7 +30,9 @@ def place(body: RigidBody, overhang: float = 0.025) -> tuple[Points, Coverage]:
     solids = [s for s in solids_of(body) if s.link > 0]
     if not solids:
         raise ConfigError("avoid.points", "no collision geometry in the URDF", "a list of points")
-    path = kept.place_of(solids, overhang, __name__, __file__)
+    said = f"{overhang!r} {[(s.link, s.name) for s in solids]}"
+    numbers = [part for s in solids for part in (s.corners, s.faces, s.planes)]
+    path = kept.place_of("points", said, numbers, __name__, __file__)
     before = kept.read(path)
     if before is not None:
         return before
@@ -83,6 +84,8 @@ def given(body: RigidBody, entries: Sequence[tuple[str, F64, float]]) -> tuple[P
 
 def coverage(points: Points, body: RigidBody, edge: float = EDGE) -> Coverage:
     """Return how well spheres cover the collision geometry of the moving links, judged by triangles up to edge [m]."""
+    from scipy.spatial import cKDTree  # see rtctl.world.meshes
+
     solids = [s for s in solids_of(body) if s.link > 0]
     covered, area, protrusion, overhang = 0.0, 0.0, 0.0, 0.0
     bare: list[str] = []

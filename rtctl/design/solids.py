@@ -5,13 +5,15 @@ polyhedron that contains it, a little larger: 1.7 % for a sphere.
 """
 
 import math
+from collections.abc import Sequence
+from importlib.metadata import version
 from typing import NamedTuple
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from rtctl.arm.model import RigidBody
+from rtctl.design import kept
 from rtctl.errors import ConfigError
 from rtctl.types import F64, I64
 
@@ -33,25 +35,37 @@ class Solid(NamedTuple):
 
 def solids_of(body: RigidBody) -> list[Solid]:
     """Return the convex pieces of the collision geometry, in the order of the URDF."""
-    solids = []
-    for thing in body.geometry.geometryObjects:
-        local = _corners(thing.geometry, str(thing.name))
+    things, corners = list(body.geometry.geometryObjects), list[F64]()
+    for thing in things:
         X = thing.placement
-        corners = local @ np.array(X.rotation).T + np.array(X.translation)
-        if not (np.abs(corners) <= REACH).all():
-            got = f"a corner {np.abs(corners).max():.4g} m from its joint"
+        corners.append(_corners(thing.geometry, str(thing.name)) @ np.array(X.rotation).T + np.array(X.translation))
+        if not (np.abs(corners[-1]) <= REACH).all():
+            got = f"a corner {np.abs(corners[-1]).max():.4g} m from its joint"
             raise ConfigError(f"collision geometry {thing.name}", got, f"at most {REACH:g} m")
-        name = body.model.frames[thing.parentFrame].name
+    hulls = _hulls([str(thing.name) for thing in things], corners)
+    return [
+        Solid(body.link_of[thing.parentJoint], body.model.frames[thing.parentFrame].name, each, *hull)
+        for thing, each, hull in zip(things, corners, hulls, strict=True)
+    ]
+
+
+def _hulls(names: Sequence[str], corners: Sequence[F64]) -> list[tuple[I64, F64]]:
+    """Return triangles (f, 3) and planes (f, 4) of the hull of each set of corners (v, 3) [m]."""
+    path = kept.place_of("hulls", f"scipy {version('scipy')}", corners, __name__, __file__)
+    said = kept.known(path)
+    if said is not None and set(said) == {"faces", "planes"} and len(said["faces"]) == len(corners):
+        return [(np.array(f, np.int64), np.array(p)) for f, p in zip(said["faces"], said["planes"], strict=True)]
+    from scipy.spatial import ConvexHull, QhullError  # see rtctl.world.meshes
+
+    found: list[tuple[I64, F64]] = []
+    for name, each in zip(names, corners, strict=True):
         try:
-            hull = ConvexHull(corners)
+            hull = ConvexHull(each)
         except QhullError:
-            raise ConfigError(f"collision geometry {thing.name}", "a flat or degenerate mesh", "a solid") from None
-        solids.append(
-            Solid(
-                body.link_of[thing.parentJoint], name, corners, hull.simplices.astype(np.int64), hull.equations.copy()
-            )
-        )
-    return solids
+            raise ConfigError(f"collision geometry {name}", "a flat or degenerate mesh", "a solid") from None
+        found.append((hull.simplices.astype(np.int64), hull.equations.copy()))
+    kept.note(path, {"faces": [f.tolist() for f, _ in found], "planes": [p.tolist() for _, p in found]})
+    return found
 
 
 def _corners(shape: coal.CollisionGeometry, name: str) -> F64:

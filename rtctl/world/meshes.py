@@ -8,7 +8,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from rtctl.kernel import kernel
 from rtctl.types import F64, I64
@@ -75,6 +74,8 @@ def mesh_body(vertices: F64, triangles: I64, hull: bool = False) -> F64:
 
 def _hull(vertices: F64) -> tuple[F64, I64]:
     """Return vertices and outward triangles of the convex hull."""
+    from scipy.spatial import ConvexHull, QhullError  # half of the time that all else takes to be imported
+
     try:
         found = ConvexHull(vertices)
     except (QhullError, ValueError):
