@@ -5,7 +5,7 @@ Kinematics are Pinocchio's, distances Coal's. A link's mesh is its convex hull.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -70,9 +70,10 @@ class Body:
         self.t: F64 = np.zeros(3)
         self._ball: tuple[float, float, float, float] | None = None
         self._box: tuple[F64, F64] | None = None
+        self._placed: list[tuple[Piece, coal.Transform3s]] | None = None
 
     def put(self, R: F64, t: F64) -> None:
-        self.R, self.t, self._ball, self._box = R, t, None, None
+        self.R, self.t, self._ball, self._box, self._placed = R, t, None, None, None
 
     def ball(self) -> tuple[float, float, float, float]:
         """Return the middle [m], in the world, and the radius [m] of a ball that holds it."""
@@ -88,9 +89,11 @@ class Body:
         radii = [float(np.linalg.norm(0.5 * (p.high - p.low))) for p in self.pieces]
         return middle, max(float(np.linalg.norm(m - middle)) + r for m, r in zip(middles, radii, strict=True))
 
-    def placed(self) -> Iterator[tuple[Piece, coal.Transform3s]]:
-        for p in self.pieces:
-            yield p, coal.Transform3s(self.R @ p.R, self.R @ p.t + self.t)
+    def placed(self) -> list[tuple[Piece, coal.Transform3s]]:
+        """Return the pieces and where they are: many bodies are measured to one that stands."""
+        if self._placed is None:
+            self._placed = [(p, coal.Transform3s(self.R @ p.R, self.R @ p.t + self.t)) for p in self.pieces]
+        return self._placed
 
     def box(self) -> tuple[F64, F64]:
         """Return the corners [m] of a box in the world that holds it: of a piece's own box, turned."""
