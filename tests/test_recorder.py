@@ -26,7 +26,7 @@ from rtctl.log.entry import Batch
 from rtctl.log.mcap.recovery import recover_folder
 from rtctl.log.read.info import info
 from rtctl.log.record import ring
-from rtctl.log.record.recorder import Recorder, rescue
+from rtctl.log.record.recorder import Recorder, blob_of, rescue, sweep
 from rtctl.log.record.writer import Options, Session, segment_path
 
 HEADER = make_header("arm", ("a", "b"), 2, 1e-3, config="x = 1\n", urdf="<robot/>")
@@ -401,3 +401,22 @@ def test_a_file_in_use_is_not_recovered_under_its_writer(tmp_path: Path) -> None
     assert recover_folder(tmp_path) == []
     session.close({"reason": "closed"})
     assert len(read(tmp_path / "arm.000.mcap")["/event"]) == 5
+
+
+def test_rings_of_simulations_that_were_killed_are_removed_and_no_others(tmp_path: Path) -> None:
+    """Each holds 32 MB of memory. One that a log is still to be made of stays, whatever its robot is called."""
+    make = (
+        "import os, sys; from pathlib import Path; from rtctl.log import make_header; "
+        "from rtctl.log.record.recorder import blob_of; from rtctl.log.record.ring import create; "
+        "header = make_header('arm', ('a',), 2, 1e-3); "
+        "create(sys.argv[1], 4096, blob_of(header, eval(sys.argv[2])), [Path(sys.argv[3])]); os._exit(0)"
+    )
+    killed, logged_, living_ = (f"rtctl-{name}.ring" for name in ("arm-sim-1", "my-sim-2", "arm-sim-3"))
+    log = [str(tmp_path / "log"), "arm", 60.0, 1 << 20, 0]
+    for name, options in ((killed, []), (logged_, log)):
+        subprocess.run([sys.executable, "-c", make, name, repr(options), str(tmp_path)], check=True)
+    mine = ring.create(living_, 4096, blob_of(HEADER), [tmp_path])
+    (tmp_path / "rtctl-none.ring").write_bytes(b"no ring")
+    sweep([tmp_path])
+    assert {path.name for path in tmp_path.glob("*.ring")} == {logged_, living_, "rtctl-none.ring"}
+    mine.unmap()

@@ -12,7 +12,7 @@ from rtctl.app.servo import Servo
 from rtctl.hal.client import default_path
 from rtctl.hal.console import Console
 from rtctl.log.header import Header
-from rtctl.log.record.recorder import CAPACITY, PREFIX, SUFFIX, Stats, blob_of
+from rtctl.log.record.recorder import CAPACITY, PREFIX, SUFFIX, Stats, blob_of, sweep
 from rtctl.log.record.ring import attach, create
 from rtctl.types import Request
 
@@ -23,6 +23,7 @@ class Live:
     def __init__(self, header: Header, config: Path, log: Path | None) -> None:
         """Raises LinkError when no ring can be had."""
         self._log = log
+        sweep()
         self._ring = create(
             f"{PREFIX}{header.robot}-sim-{os.getpid()}{SUFFIX}", CAPACITY, blob_of(header, config=config)
         )

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -351,13 +351,31 @@ def rescue(directory: Path | str, folders: Sequence[Path] = ()) -> list[Path]:
     """
     directory = Path(directory).absolute()
     before = set(directory.glob("*.mcap"))
-    for folder in folders or (rings.SHM, Path(tempfile.gettempdir())):
-        for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
-            with contextlib.suppress(LinkError, LogError, TrustError, OSError):
-                if _orphan(path, directory):
-                    drain(path)
+    for path in _rings(folders):
+        with contextlib.suppress(LinkError, LogError, TrustError, OSError):
+            if _orphan(path, directory):
+                drain(path)
+    sweep(folders)
     recover_folder(directory)
     return sorted(set(directory.glob("*.mcap")) - before)
+
+
+def sweep(folders: Sequence[Path] = ()) -> None:
+    """Remove the rings that simulations of this user left when they were killed: no log is of them."""
+    for path in _rings(folders):
+        with contextlib.suppress(LinkError, TrustError, OSError, ValueError):
+            ring = attach(path)
+            try:
+                left = json.loads(ring.blob).get("options") == [] and not ring.producer_alive()
+            finally:
+                ring.unmap()
+            if left:
+                path.unlink()
+
+
+def _rings(folders: Sequence[Path]) -> Iterator[Path]:
+    for folder in folders or (rings.SHM, Path(tempfile.gettempdir())):
+        yield from sorted(folder.glob(f"{PREFIX}*{SUFFIX}"))
 
 
 def _orphan(path: Path, directory: Path) -> bool:
