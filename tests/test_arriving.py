@@ -21,6 +21,11 @@ def balls(*at: tuple[float, float, float]) -> tuple[Json, ...]:
     )
 
 
+def posts(*at: tuple[float, float, float]) -> tuple[Json, ...]:
+    size = {"type": "capsule", "radius_m": 0.05, "length_m": 0.4}
+    return tuple({"name": f"o{k}", **size, "position_m": position} for k, position in enumerate(at))
+
+
 class Case(NamedTuple):
     goal: Json
     obstacle: tuple[Json, ...]
@@ -68,6 +73,31 @@ CASES = {
         7.5,
         (-1.653732, 1.31829, 0.879154, -0.521153, -1.921463, 3.605905, 0.264111),
         planner=True,
+    ),
+    # the law goes up to it first, and needs 5.5 s
+    "on the other side of a wall": Case(
+        {"position_m": (0.45, -0.25, 0.3)},
+        ({"name": "wall", "type": "box", "size_m": (0.5, 0.02, 0.4), "position_m": (0.45, 0.0, 0.2)},),
+        2.3,
+        (0.0639, -0.0741, 0.4370, -2.2232, 0.0376, 2.1557, 1.2645),
+    ),
+    # the joints alone would go straight, the tip 2.3 m about, in 6.7 s
+    "between two posts with a tool": Case(
+        {
+            "position_m": (-0.70384, 0.34322, 0.44866),
+            "wxyz": (0.59778873, 0.72611048, -0.02581752, 0.33874129),
+        },
+        posts((-0.70994, 0.05693, 0.44866), (-0.48203, 0.52432, 0.44866)),
+        3.2,
+        (0.0391, 2.5606, 2.2795, 3.4085, 3.7514, 5.5919),
+        robot="ur5",
+    ),
+    # the law alone circles a post, and needs 9.4 s
+    "between two posts from below": Case(
+        {"position_m": (-0.4521, -0.31354, 1.08345)},
+        posts((-0.25091, -0.39307, 1.08345), (-0.45607, -0.09725, 1.08345)),
+        4.5,
+        (0.8159, 1.1432, 1.2241, -1.3354, -1.5571, 0.2329, -0.7473),
     ),
     # the wrist of a UR5 turns 14 mm beside its forearm, within what these keep of each other
     "a tool turned past a folded link": Case(

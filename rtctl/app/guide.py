@@ -13,6 +13,7 @@ import numpy as np
 
 from rtctl.app import plan
 from rtctl.app.postures import (
+    STEP,
     Ending,
     Site,
     endings,
@@ -30,6 +31,8 @@ from rtctl.app.way import Way, comes, heading, moves, progress, travelled, way_o
 from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
+from rtctl.arm.search import lasts
+from rtctl.arm.task import error_of
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Advice, Goal, Shape, State, Status
@@ -54,6 +57,9 @@ STUCK = 0.8  # [s] without progress along a way
 SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
 PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
 AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
+WATCH = 0.5  # [s] between two looks whether an arm that moves gets there in time
+LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, after which the law is late
+DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
 PLANS = 8  # for one goal in a world that stands still
 
 
@@ -83,7 +89,7 @@ def warm(robot: Robot) -> None:
     tip = robot.body.evaluate(robot.home, np.zeros(robot.n), robot.points)
     goal = Goal(tip.x, quat_of(tip.R), robot.axes, robot.tolerance, robot.tolerance_rot)
     endings(site, goal, 0, seeds=1)
-    previewed(site, goal, robot.q_rest, inertia_of(site))
+    previewed(site, goal, robot.q_rest, inertia_of(site), robot.avoid.rho_min)
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
     heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
     plan.warm(site)
@@ -100,6 +106,8 @@ class Guide:
     waits_since: int  # tick; -1: it does not wait
     look: int  # tick of the next look at what comes
     again: int  # tick of the next attempt
+    late: int  # tick by which the arm should be there; -1: nothing is known of that
+    watch: int  # tick of the next look whether it will
     tries: int
     blocked: bool  # something comes across the way
     told: str  # why there was no way
@@ -149,6 +157,8 @@ class Guide:
             return self._reviewed(m, m.goal)
         if m.status in HELD and m.tick >= self.again:
             return self._held(m, m.goal)
+        if m.status == Status.MOVING and self.late >= 0 and m.tick >= max(self.watch, self.again):
+            return self._overdue(m, m.goal)
         return None
 
     def _scene(self, m: Seen) -> bytes:
@@ -174,17 +184,87 @@ class Guide:
             if not there or not free_of_all(site, Q[-1]):
                 break
         else:
-            return None
+            return self._sooner(m, goal, site, Q)
         self.ends = self._endings(site, goal)
         for end in self.ends:
             Q, there = previewed(site, goal, end.q, A)
             if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
+                self._expect(m, STEP * len(Q))
                 return self._given(end)
-        led = next((advice for end in self.ends if (advice := self._straight(site, end)) is not None), None)
-        if led is not None:
-            return led
-        planned = self._planned(m, goal, site) if not there and self.plans else None
-        return planned or (self._given(self.ends[0]) if self.ends else None)
+        straight = next((way for end in self.ends if (way := self._straight(site, end)) is not None), None)
+        if straight is not None:
+            return self._led(m, goal, site, straight)
+        if not self.ends:
+            return self._planned(m, goal, site) if not there and self.plans else None
+        self.given = self.ends[0]
+        planned = self._sooner(m, goal, site, Q) if there else self._planned(m, goal, site) if self.plans else None
+        return planned or self._given(self.ends[0])
+
+    # -- what the law would not do in time ---------------------------------------------------------------------------
+
+    def _sooner(self, m: Seen, goal: Goal, site: Site, Q: F64) -> Advice | None:
+        """Plan where the law, past what rests, would be held or much later than on the free way Q (k, n)."""
+        free = takes = STEP * len(Q)
+        if self.plans and self._is_met(site, Q):
+            takes = self._law_takes(site, goal)
+        self._expect(m, takes if takes < np.inf else free)
+        return self._planned(m, goal, site, takes) if takes > _late(free) else None
+
+    def _led(self, m: Seen, goal: Goal, site: Site, straight: F64) -> Advice:
+        """Lead the joints straight, or along a planned way where that takes much longer than the tip would, and it."""
+        takes = self._lasts(site, straight)
+        if self.plans and takes > _late(self._tip_takes(site, goal)):
+            planned = self._planned(m, goal, site, takes)
+            if planned is not None:
+                return planned
+        return heading(site, self._take(site, straight), 0, False)
+
+    def _lasts(self, site: Site, path: F64) -> float:
+        return lasts(site.chain, path, plan.speeds_of(self.robot))
+
+    def _tip_takes(self, site: Site, goal: Goal) -> float:
+        """Return the time [s] of the tip straight to the goal."""
+        tip = self.robot.body.evaluate(site.start, np.zeros(self.robot.n), self.robot.points)
+        far, turned = error_of(goal, tip.x, tip.R)
+        return max(far / self.robot.motion.v_max, turned / self.robot.motion.w_max)
+
+    def _overdue(self, m: Seen, goal: Goal) -> Advice | None:
+        """Plan for an arm that moves, where it will be held or late."""
+        site = self._site(m)
+        self.watch = m.tick + round(WATCH / self.robot.dt)
+        takes = self._law_takes(site, goal)
+        if takes < LATEST or m.tick + takes / self.robot.dt < self.late:
+            return None
+        if takes < np.inf:
+            self._expect(m, takes)
+        return self._planned(m, goal, site, takes)
+
+    def _expect(self, m: Seen, takes: float) -> None:
+        """Take note of when an arm should be there that takes so long [s]."""
+        if self.plans:
+            self.late = m.tick + round(_late(takes) / self.robot.dt)
+            self.watch = m.tick + round(WATCH / self.robot.dt)
+
+    def _law_takes(self, site: Site, goal: Goal) -> float:
+        """Return the time [s] in which the law gets there past what rests, infinite where that holds it."""
+        keep, rest = self.robot.avoid.rho_min, self.robot.q_rest
+        if self.given is not None:
+            keep, rest = min(keep, self.given.rho), self.given.q
+        Q, there = previewed(site, goal, rest, self._dulled(site), keep)
+        return STEP * len(Q) if there else np.inf
+
+    def _dulled(self, site: Site) -> F64:
+        """Return an inertia (n, n) [kg m2] of which light joints have more: pushed aside, they are damped as well."""
+        A = inertia_of(site)
+        out: F64 = A + DULL * A.diagonal().max() * np.eye(self.robot.n)
+        return out
+
+    def _is_met(self, site: Site, Q: F64) -> bool:
+        """Return whether something that rests is in the way Q (k, n)."""
+        o, keep = site.obstacles, self.robot.avoid.rho_min
+        rests = o._replace(active=o.active & ~(o.v.any(axis=1) | o.w.any(axis=1)))
+        rho = clearance_of(site.chain, self.robot.points, Q, rests, self.robot.avoid.rho0)
+        return bool(rho.min() < min(keep, 0.9 * min(rho[0], rho[-1])))
 
     def _endings(self, site: Site, goal: Goal) -> list[Ending]:
         """Return postures that have the goal, as far from joint limits as there are any."""
@@ -213,12 +293,11 @@ class Guide:
         apart = own_room(site, Q) >= self.robot.self_avoid.rho_min
         return apart and bool(rho.min() > min(self.robot.avoid.rho_min, 0.9 * min(rho[0], rho[-1])))
 
-    def _straight(self, site: Site, end: Ending) -> Advice | None:
-        """Take the straight way to a posture where it is free."""
+    def _straight(self, site: Site, end: Ending) -> F64 | None:
+        """Return the straight way to a posture where it is free."""
         least = 0.9 * min(self.robot.avoid.rho_min, end.rho, self._room(site, site.start))
-        if straight_room(site, site.start, end.q) <= max(least, 1e-3):
-            return None
-        return heading(site, self._take(site, np.array([site.start, end.q])), 0, False)
+        free = straight_room(site, site.start, end.q) > max(least, 1e-3)
+        return np.array([site.start, end.q]) if free else None
 
     def _room(self, site: Site, q: F64) -> float:
         return float(clearance_of(site.chain, self.robot.points, q[None], site.obstacles)[0])
@@ -235,9 +314,11 @@ class Guide:
         self.tries += 1
         self.ends = self._endings(site, goal)
         far = [end for end in self.ends if np.abs(end.q - site.start).max() > 3.0 * NEAR]
-        return next((advice for end in far if (advice := self._straight(site, end)) is not None), None)
+        straight = next((way for end in far if (way := self._straight(site, end)) is not None), None)
+        return None if straight is None else heading(site, self._take(site, straight), 0, False)
 
-    def _planned(self, m: Seen, goal: Goal, site: Site) -> Advice | None:
+    def _planned(self, m: Seen, goal: Goal, site: Site, takes: float = np.inf) -> Advice | None:
+        """Take a planned way, None where there is none beside which the law, which `takes` so long [s], is late."""
         if self.tries >= PLANS and not moves(site):
             return None
         self.tries += 1
@@ -253,6 +334,8 @@ class Guide:
                 self.events.append(("no_plan", why))
             self.told = why
             self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
+            return None
+        if takes < _late(self._lasts(site, path)):
             return None
         self.events.append(("planned", f"a way of {len(path)} postures around what holds the arm"))
         return heading(site, self._take(site, path), 0, False)
@@ -296,4 +379,10 @@ class Guide:
     def _forget(self) -> None:
         self.way, self.given, self.ends = None, None, []
         self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
+        self.late, self.watch = -1, 0
         self.blocked, self.told, self.scene = False, "", b""
+
+
+def _late(takes: float) -> float:
+    """Return the time [s] after which an arm is late that could take so long [s]."""
+    return LATER * takes + LATEST

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.kinematics import ROLLOUT, Chain, Pace, chain_of, clearance_of, postures_of, rollout, target_of
+from rtctl.arm.kinematics import Chain, chain_of, clearance_of, postures_of, target_of
 from rtctl.arm.model import RigidBody
+from rtctl.arm.outlook import Around, Pace, rollout
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
 from rtctl.design.solids import solids_of, surface
@@ -157,14 +158,15 @@ def inertia_of(site: Site) -> F64:
     return site.robot.body.evaluate(site.start, np.zeros(site.robot.n), site.robot.points).A
 
 
-def previewed(site: Site, goal: Goal, rest: F64, A: F64) -> tuple[F64, bool]:
+def previewed(site: Site, goal: Goal, rest: F64, A: F64, keep: float | None = None) -> tuple[F64, bool]:
     """Return the postures (k, n), STEP apart, in which the tip would go to a goal, and whether it gets there.
 
-    A (n, n): what the joints share the tip's way by; see `rollout`.
+    A (n, n): what the joints share the tip's way by. keep [m]: what rests is kept off so far; None: gone through.
     """
-    robot, p = site.robot, site.robot.motion
-    margin = 0.4 * robot.limit.rho0
-    Q = rollout(
+    robot, p, points = site.robot, site.robot.motion, site.robot.points
+    margin, o = 0.4 * robot.limit.rho0, site.obstacles
+    beside = np.flatnonzero(~(o.v.any(axis=1) | o.w.any(axis=1)) & (keep is not None))
+    return rollout(
         site.chain,
         site.start,
         rest,
@@ -172,9 +174,9 @@ def previewed(site: Site, goal: Goal, rest: F64, A: F64) -> tuple[F64, bool]:
         robot.q_min + margin,
         robot.q_max - margin,
         Pace(p.v_max, p.w_max, p.speed_margin * robot.qd_max, p.qdd_posture / p.d_q, p.k_q / p.d_q, A),
+        Around(points.link, points.local, points.radius, _chosen(o, beside), keep or 0.0),
         STEP,
     )
-    return Q, len(Q) <= ROLLOUT
 
 
 def free_of_all(site: Site, q: F64) -> bool:

@@ -20,8 +20,6 @@ from rtctl.world.rooms import count_rooms, farthest
 
 REACHED = 1e-4  # [m], and ten times that [rad], of a posture that has a goal
 STEPS = 80  # of the inverse kinematics
-ROLLOUT = 160  # steps of a rollout
-NEAR_ENOUGH = 2e-3  # [m], and five times that [rad], where a rollout ends
 LARGEST = 0.4  # [rad] of a joint in one of them
 
 
@@ -231,40 +229,6 @@ def _damped_step(J: F64, e: F64, free: B1, damping: float) -> F64:
 
 
 @kernel
-def _easiest_step(J: F64, e: F64, A: F64, free: B1, damping: float) -> F64:
-    """Return M J^T (J M J^T + damping I)^-1 e, M the inverse of A (n, n), over its largest element, of what is free."""
-    k, n = J.shape
-    among = A.copy()
-    for i in range(n):
-        if not free[i]:
-            among[i, :], among[:, i] = 0.0, 0.0
-            among[i, i] = A[i, i]
-    M, JM, G, step = spd_inverse(among), np.zeros((k, n)), np.zeros((k, k)), np.zeros(n)
-    largest = 0.0
-    for i in range(n):
-        if free[i]:
-            largest = max(largest, M[i, i])
-    for a in range(k):
-        for i in range(n):
-            if free[i]:
-                for j in range(n):
-                    if free[j]:
-                        JM[a, i] += J[a, j] * (M[j, i] / largest)
-        for b in range(k):
-            for i in range(n):
-                G[a, b] += JM[a, i] * J[b, i]
-        G[a, a] += damping
-    G_inv = spd_inverse(G)
-    for a in range(k):
-        y = 0.0
-        for b in range(k):
-            y += G_inv[a, b] * e[b]
-        for i in range(n):
-            step[i] += JM[a, i] * y
-    return step
-
-
-@kernel
 def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tuple[F64, bool]:
     """Return a posture (n,) near q0 that has the goal within low and high (n,), and whether it has.
 
@@ -313,73 +277,6 @@ def postures_of(chain: Chain, seeds: F64, goal: Target, low: F64, high: F64) -> 
     for s in range(seeds.shape[0]):
         out[s], has[s] = posture_of(chain, seeds[s], goal, low, high)
     return out, has
-
-
-class Pace(NamedTuple):
-    """How fast the law goes to a goal."""
-
-    v: float  # [m/s]
-    w: float  # [rad/s]
-    qd: F64  # (n,) [rad/s] at most
-    drift: F64  # (n,) [rad/s] at most towards the posture
-    gain: float  # [1/s] of that
-    A: F64  # (n, n) [kg m2] inertia, whose kinetic energy the motion keeps least; the identity: the speeds' squares
-
-
-@kernel
-def rollout(chain: Chain, q0: F64, rest: F64, goal: Target, low: F64, high: F64, pace: Pace, dt: float) -> F64:
-    """Return the postures (k, n), dt [s] apart, of a tip that goes straight to a goal and joints that drift to `rest`.
-
-    The law without obstacles, to see where it would end: within low and high (n,) all the same. Of all joint speeds
-    that move the tip so it takes those of least kinetic energy, as the law does, for an inertia that stays as it is.
-    The last posture has the goal where k is not more than ROLLOUT.
-    """
-    n = q0.shape[0]
-    out, q, R, t = np.empty((ROLLOUT + 1, n)), q0.copy(), np.empty((n + 1, 3, 3)), np.empty((n + 1, 3))
-    for b in range(ROLLOUT + 1):
-        out[b] = q
-        placements(chain, q, R, t)
-        x, turn, J = tip_at(chain, R, t)
-        e, e_rot = task_error(goal.task, goal.axis, goal.position, goal.wxyz, x, turn)
-        far, turned = np.sqrt((e * e).sum()), np.sqrt((e_rot * e_rot).sum())
-        if far < NEAR_ENOUGH and turned < 5.0 * NEAR_ENOUGH:
-            return out[: b + 1].copy()
-        S = selection(goal.task, goal.axis, turn)
-        k = S.shape[0]
-        Js, es = np.zeros((k, n)), np.zeros(k)
-        e *= min(1.0, pace.v * dt / max(far, 1e-12))
-        e_rot *= min(1.0, pace.w * dt / max(turned, 1e-12))
-        for a in range(k):
-            for c in range(3):
-                es[a] += S[a, c] * e[c] + S[a, 3 + c] * e_rot[c]
-            for c in range(6):
-                for i in range(n):
-                    Js[a, i] += S[a, c] * J[c, i]
-        free, step = np.ones(n, np.bool_), np.zeros(n)
-        drift = np.minimum(np.maximum(pace.gain * (rest - q), -pace.drift), pace.drift) * dt
-        for _again in range(3):
-            wanted = es.copy()
-            for a in range(k):
-                for i in range(n):
-                    if free[i]:
-                        wanted[a] -= Js[a, i] * drift[i]
-            step = _easiest_step(Js, wanted, pace.A, free, 1e-4)
-            bound = False
-            for i in range(n):
-                step[i] = step[i] + drift[i] if free[i] else 0.0
-            for i in range(n):
-                if free[i] and ((q[i] >= high[i] and step[i] > 0.0) or (q[i] <= low[i] and step[i] < 0.0)):
-                    free[i] = False
-                    bound = True
-            if not bound:
-                break
-        share = 1.0
-        for i in range(n):
-            if abs(step[i]) * share > pace.qd[i] * dt:
-                share = pace.qd[i] * dt / abs(step[i])
-        for i in range(n):
-            q[i] = min(max(q[i] + share * step[i], min(low[i], q[i])), max(high[i], q[i]))
-    return out
 
 
 def clearance_of(chain: Chain, points: Points, Q: F64, obstacles: Obstacles, cutoff: float = np.inf) -> F64:
