@@ -1,6 +1,7 @@
 """Payload and friction that nobody told of: seen by the momentum observer, carried by the law, judged by the plant."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from rtctl.arm.memory import fresh, record_of
 from rtctl.arm.sensing import _stick, _surprise
 from rtctl.experiment import rates, scene
 from rtctl.kernel.rotations import quat_of
+from rtctl.types import State
 from tests.lab import ROOT, Lab, lab, robot
 
 
@@ -86,6 +88,29 @@ def test_at_slow_rates_it_is_carried_as_well(hz: int, plant: dict[str, float]):
     assert np.linalg.norm(trace.tip[-1] - goal) < 3e-3
     rest = trace.tip[trace.rows(2.5, 3.0)]
     assert np.ptp(rest, axis=0).max() < 3e-3
+
+
+def test_nothing_is_learnt_of_a_joint_that_is_silent_while_it_is_damped(tmp_path: Path):
+    """The plant carries nothing and does not rub, so nothing is to be carried, however a joint brakes that is not heard.
+
+    At a slow servo rate a drive may be silent for tens of milliseconds before it counts as lost. What its braking makes
+    of the observer's torque is several Nm.
+    """
+    path = scene.variant(ROOT / "configs" / "panda.toml", tmp_path, rates.changes_of(100, 100))
+    with lab(path=path, inject=("drive_fault@0.8:6", "silent@0.84:3:0.08")) as here:
+        here.running()
+        here.ask([0.45, 0.35, 0.45])
+        until(here, lambda m: m.state == State.SAFE_STOP, 2.0)
+        unheard, carried, seen = 0, 0.0, 0.0
+        while not here.memory.off:
+            turn = here.step()
+            if turn.feedback.replies[3] == 0:
+                unheard += 1
+                carried = max(carried, float(np.abs(here.memory.lasting).max()))
+                seen = max(seen, abs(float(here.memory.external[3])))
+        assert unheard >= 2
+        assert seen > 2.0  # [Nm]: there was something to be taken in
+        assert carried < 0.5
 
 
 def test_a_light_joint_that_sticks_under_a_payload_has_no_stuck_encoder():
