@@ -91,7 +91,7 @@ def test_at_slow_rates_it_is_carried_as_well(hz: int, plant: dict[str, float]):
 
 
 def test_nothing_is_learnt_of_a_joint_that_is_silent_while_it_is_damped(tmp_path: Path):
-    """The plant carries nothing and does not rub, so nothing is to be carried, however a joint brakes that is not heard.
+    """The plant carries nothing and does not rub, so nothing is to be carried, however a joint brakes unheard.
 
     At a slow servo rate a drive may be silent for tens of milliseconds before it counts as lost. What its braking makes
     of the observer's torque is several Nm.

@@ -34,6 +34,7 @@ def changes(source: str) -> set[tuple[str, str]]:
         ("def f(x):\n    return max(x, 0)", "max(x, 0)", "(min(x, 0))"),
         ("T = {A: 1, B: 2}", "A: 1,", ""),
         ("T = (R(1), R(2))", "R(2)", ""),
+        ("A, B = R(1), R(2)\nC = 3", "R(2)", ""),  # and what comes next stays a line of its own
     ],
 )
 def test_every_kind_of_change_is_made(source: str, was: str, becomes: str):

@@ -36,6 +36,7 @@ class Target(NamedTuple):
 TARGETS = (
     Target("rtctl/arm/limits.py", ("test_arm_limits",), False),
     Target("rtctl/arm/faults.py", ("test_faults_alone",), False),
+    Target("rtctl/arm/own_loop.py", ("test_own_loop",), False),
     Target("rtctl/arm/supervision.py", ("test_arm_supervision", "test_faults")),
     Target("rtctl/control/faults.py", ("test_faults_alone",), False),
     Target("rtctl/control/supervisor.py", ("test_supervisor",), False),

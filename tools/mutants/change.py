@@ -70,7 +70,8 @@ def mutants(source: str) -> list[Mutant]:
     for scope, first, node, becomes in _changes(ast.parse(source), "", False):
         start, end = offset(first.lineno, first.col_offset), offset(node.end_lineno or 0, node.end_col_offset or 0)
         if not becomes:
-            end += len(source[end:]) - len(source[end:].lstrip().removeprefix(","))
+            rest = source[end:].lstrip()
+            end = len(source) - len(rest) + 1 if rest.startswith(",") else end
         was = source[start:end]
         if was != becomes:
             seen[scope, was, becomes] += 1
