@@ -21,13 +21,13 @@ from rtctl.arm.disturbance import (
     within,
 )
 from rtctl.arm.faults import BIT, DISTRUST
-from rtctl.arm.friction import GUIDED, rubbing, sliding, speeds_of
+from rtctl.arm.friction import GUIDED, SLIDING, rubbing, smoothing, speeds_of
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import drives_torque
 from rtctl.arm.target import parking_progress, target_of
 from rtctl.arm.task import task_error
 from rtctl.kernel import kernel
-from rtctl.kernel.reductions import norm
+from rtctl.kernel.reductions import largest, norm
 from rtctl.types import F64, Feedback, RecordRow, Severity, State
 
 UNFELT = 2.0  # times what is noticeable: a hand that pushes a joint less than that does not move it
@@ -40,7 +40,7 @@ _STRUCK = BIT["collision_hard"]
 
 
 @kernel
-def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: float) -> None:
+def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, Jbar: F64, elapsed: float) -> None:
     """Observe what pushes the joints while the arm is free to move; f: plausible, `elapsed` [s] after the last one."""
     n = f.q.shape[0]
     qd = f.qd.copy()
@@ -49,11 +49,11 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
         m.noticed, m.settled, m.touches, m.contact_level = 0, 0, 0, 0
         m.track[:n], m.unsure[:n], m.expected[:n], m.steady[:n] = 0.0, 0.0, 0.0, 0.0
         return
-    load, resting, silent = np.empty(n), True, False
+    load, resting, silent, rubs = np.empty(n), True, False, known_friction(c, m, model, Jbar)
     for i in range(n):
         if not (f.replies[i] > 0 and np.isfinite(qd[i])):
             qd[i], silent = m.qd_measured[i], True
-        load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i] + c.coulomb[i] * sliding(m.qd[i])
+        load[i] = model.h[i] + model.g[i] + c.viscous[i] * m.qd[i] + rubs[i]
         resting = resting and abs(qd[i]) < RESTING
     # the speed measured now ends the period in which the command before the last one was applied
     before, tau = m.qd_measured[:n].copy(), m.sent[1, :n].copy()
@@ -77,8 +77,25 @@ def observe(c: RecordRow, m: RecordRow, f: Feedback, model: Model, elapsed: floa
     elif m.settled == 0 or m.noticed == 0:
         m.lasting[:n] = slow_part(m.lasting[:n].copy(), external, bound, elapsed)
     least = c.noticeable[:n].copy()
-    if m.noticed == 0 and beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least)):
+    unsure = largest(smoothing(c.coulomb[:n].copy(), model.A_inv, c.dt)) > SLIDING  # not all that is told is given
+    if m.noticed == 0 and (unsure or beyond(m.lasting[:n].copy(), rounding(model.A, c.joint_r_qd[:n].copy(), least))):
         m.noticed = 1
+
+
+@kernel
+def known_friction(c: RecordRow, m: RecordRow, model: Model, Jbar: F64) -> F64:
+    """Return the dry friction (n,) [Nm] that the file tells of, as it is counted; Jbar (n, 6).
+
+    While the law drives the arm it is counted as it was given, at the speeds asked for: what a joint rubs less than
+    that, or the other way, is external to it as untold friction is. At the speeds measured it would turn with each of
+    their signs, and what is learnt of that comes late: friction that is not there would shake the arm by itself. A
+    damped or a guided arm is asked for nothing: there it brakes what moves.
+    """
+    n = model.q.shape[0]
+    coulomb, qd = c.coulomb[:n].copy(), m.qd[:n].copy()
+    if not (m.floating != 0 or (m.state == _SAFE_STOP and m.reaction >= _SS1)):
+        qd = speeds_of(Jbar, m.v_before.copy(), m.w_before.copy())
+    return rubbing(coulomb, np.zeros(n), qd, smoothing(coulomb, model.A_inv, c.dt))
 
 
 @kernel
@@ -107,7 +124,7 @@ def _error(c: RecordRow, m: RecordRow, n: int) -> float:
 
 
 @kernel
-def pushed(c: RecordRow, m: RecordRow, Jbar: F64, n: int) -> tuple[F64, F64]:
+def pushed(c: RecordRow, m: RecordRow, model: Model, Jbar: F64) -> tuple[F64, F64]:
     """Return what the law carries as if it were gravity, and what a hand does to an arm that floats, (n,) [Nm].
 
     Carried is what lasts, and known friction. An arm that floats is taken to be held by all that is external to it and
@@ -115,16 +132,18 @@ def pushed(c: RecordRow, m: RecordRow, Jbar: F64, n: int) -> tuple[F64, F64]:
     against the hand what keeps the bound. A touch lighter than UNFELT moves nothing, and what moves comes to rest: else
     what is not known of the load would set an arm without friction in motion.
     """
+    n = model.q.shape[0]
     lasting = m.lasting[:n].copy() if m.noticed != 0 else np.zeros(n)
     coulomb, viscous = c.coulomb[:n].copy(), c.viscous_told[:n].copy()
+    smooth = smoothing(coulomb, model.A_inv, c.dt)
     if m.floating != 0:
         external, hand = m.external[:n].copy(), np.empty(n)
         for i in range(n):
             felt, zone = external[i] - lasting[i], UNFELT * c.noticeable[i]
             hand[i] = felt - min(max(felt, -zone), zone) - GENTLE * c.stop_damping[i] * m.qd[i]
-        return external - GUIDED * rubbing(coulomb, viscous, m.qd[:n].copy()), hand
+        return external - GUIDED * rubbing(coulomb, viscous, m.qd[:n].copy(), smooth), hand
     asked = speeds_of(Jbar, m.v_ref.copy(), m.w_ref.copy())
-    return lasting - rubbing(coulomb, viscous, asked), np.zeros(n)
+    return lasting - rubbing(coulomb, viscous, asked, smooth), np.zeros(n)
 
 
 @kernel

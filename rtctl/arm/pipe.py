@@ -342,7 +342,7 @@ def compile_part(robot: Robot, part: int) -> None:
     if part == 1:
         compile_for(act, robot.arm, m, model, space, around, feedback, Asked(0, 0, 0), memory.ends)
         return
-    compile_for(limited, robot.arm.constants[0], m, feedback, model, np.zeros((KEEP + 1, robot.n)))
+    compile_for(limited, robot.arm.constants[0], m, feedback, model, space.Jbar, np.zeros((KEEP + 1, robot.n)))
     compile_for(held, robot.arm.constants[0], m, feedback, model, around)
 
 

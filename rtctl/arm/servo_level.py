@@ -14,11 +14,10 @@ from rtctl.arm.escape import Phase
 from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
 from rtctl.arm.field import APART, APART_LED, Ends
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
-from rtctl.arm.friction import rubbing
 from rtctl.arm.joint_field import LEAST_REACH
 from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Ahead, Cover, Motion, WorkMemory, law, outputs
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
-from rtctl.arm.loads import loaded, observe, pushed
+from rtctl.arm.loads import known_friction, loaded, observe, pushed
 from rtctl.arm.memory import HOT, MEASURED_POSTURE
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
@@ -161,7 +160,7 @@ def _move(around: Surroundings, dt: float) -> None:
 
 
 @kernel
-def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings, asked: Asked) -> int:
+def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, Jbar: F64, around: Surroundings, asked: Asked) -> int:
     """Run the first half of a tick; return what Python must do before the other, and whether the obstacles moved."""
     plausible, implausible = plausible_feedback(c, m, f)
     moved, elapsed = DONE, c.dt * (1 + min(f.missed, MISSED_MAX))
@@ -174,7 +173,7 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surrou
         if predict(c, m, plausible, model, elapsed):
             return MODEL | moved
     correct(c, m, model)
-    observe(c, m, plausible, model, elapsed)
+    observe(c, m, plausible, model, Jbar, elapsed)
     free = m.goal_task & _POSITION != _POSITION
     if m.has_goal != 0 and (moved or asked.bits & WORLD or free or has_velocity(m)):
         around.goal_rho[:] = distances_from(around.obstacles, point_along(m.goal_task, m.goal.copy(), m.x))
@@ -204,7 +203,7 @@ def held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surround
 
 
 @kernel
-def limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64) -> tuple[int, F64]:
+def limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, Jbar: F64, torques: F64) -> tuple[int, F64]:
     """Turn the torques of the law into what the drives are asked for; return types.Drive and what was wanted (n,)."""
     n, noticed = f.q.shape[0], m.noticed != 0
     drive, keep = torques[DRIVE].copy(), torques[KEEP].copy()
@@ -218,9 +217,7 @@ def limited(c: RecordRow, m: RecordRow, f: Feedback, model: Model, torques: F64)
     m.qdd[:n] = 0.0
     if command == _TORQUE and m.state != _ARMED:  # in ARMED brakes may still hold the arm
         viscous, g = c.viscous[:n].copy(), model.g - m.external[:n] if noticed else model.g
-        m.qdd[:n] = acceleration(
-            model.A_inv, tau, model.h, g + rubbing(c.coulomb[:n].copy(), np.zeros(n), qd), viscous, qd
-        )
+        m.qdd[:n] = acceleration(model.A_inv, tau, model.h, g + known_friction(c, m, model, Jbar), viscous, qd)
     m.limit_flags, m.slew_follows_echo = within.flags | m.limit_flags, 1 if follows else 0
     return command, within.tau_wanted
 
@@ -259,7 +256,7 @@ def act(
     c, n = arm.constants[0], f.q.shape[0]
     e, e_rot, q_rest = wanted(c, m, model, asked.bits & CHOSEN != 0)
     q, qd, x, R, xd, omega = m.q[:n].copy(), m.qd[:n].copy(), m.x.copy(), m.R.copy(), m.xd.copy(), m.omega.copy()
-    carried, hand = pushed(c, m, space.Jbar, n)
+    carried, hand = pushed(c, m, model, space.Jbar)
     m.drive_given[:n] = (
         let_drive(c, model, m.drive_given[:n].copy(), m.drive[:n].copy()) if m.driven != 0 else np.zeros(n)
     )
@@ -303,7 +300,7 @@ def act(
     if holds_itself(c, m):
         command, tau_wanted = held(c, m, f, model, around)
     else:
-        command, tau_wanted = limited(c, m, f, model, torques)
+        command, tau_wanted = limited(c, m, f, model, space.Jbar, torques)
     pursued = target_of(m, m.has_goal != 0 and m.state == _RUN)
     p = progress_of(pursued.task, pursued.axis, pursued.position, pursued.wxyz, x, R, xd, omega)
     if m.parking != 0 and m.state == _RUN:
@@ -359,7 +356,7 @@ def servo(
     m = memory.view(HOT)[0]
     model, space = model_in(parameters, feedback.q.shape[0], arm.radius.shape[0])
     around = surroundings(table, shapes, bodies)
-    flags = _sense(arm.constants[0], m, feedback, model, around, wish) if wish.stage != DECIDED else DONE
+    flags = _sense(arm.constants[0], m, feedback, model, space.Jbar, around, wish) if wish.stage != DECIDED else DONE
     if flags & (MODEL | ATTENTION):
         return memory, table, np.empty(0, np.uint32), flags
     raw, more = act(arm, m, model, space, around, feedback, wish, ends)
