@@ -363,14 +363,23 @@ def rescue(directory: Path | str, folders: Sequence[Path] = ()) -> list[Path]:
 def sweep(folders: Sequence[Path] = ()) -> None:
     """Remove the rings that simulations of this user left when they were killed: no log is of them."""
     for path in _rings(folders):
-        with contextlib.suppress(LinkError, TrustError, OSError, ValueError):
+        with contextlib.suppress(LinkError, TrustError, OSError):
             ring = attach(path)
             try:
-                left = json.loads(ring.blob).get("options") == [] and not ring.producer_alive()
+                left = not ring.producer_alive() and _logless(ring.blob)
             finally:
                 ring.unmap()
             if left:
                 path.unlink()
+
+
+def _logless(blob: bytes) -> bool:
+    """Return whether a ring says that no log is made of it; one that says nothing sensible does not."""
+    try:
+        said = json.loads(blob)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(said, dict) and said.get("options") == []
 
 
 def _rings(folders: Sequence[Path]) -> Iterator[Path]:
