@@ -19,6 +19,8 @@ from firmware_sim.settings import SettingsError
 
 PEERS_MAX = 16
 REOPEN_S = 1.0
+LISTENS = 1 << 24  # [bytes] that may wait for a peer that has said nothing yet
+SO_SNDBUFFORCE = 32  # sets what SO_SNDBUF does, beyond net.core.wmem_max; needs CAP_NET_ADMIN
 
 
 class Bus(Protocol):
@@ -72,6 +74,7 @@ class Hub:
         self._listener.listen(PEERS_MAX)
         self._inode = os.stat(path).st_ino
         self._peers: dict[int, socket.socket] = {}
+        self._listeners: dict[int, int] = {}  # peers that have said nothing -> what may wait for others [bytes]
         self._sources = [self._listener.fileno()]
         self._ready: list[int] = []
 
@@ -109,6 +112,8 @@ class Hub:
             peer.close()
             return
         peer.setblocking(False)
+        self._listeners[peer.fileno()] = peer.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        _let_wait(peer, LISTENS)  # who only writes down what is said may be kept from it by a busy machine
         self._peers[peer.fileno()] = peer
         self._sources.append(peer.fileno())
 
@@ -118,12 +123,16 @@ class Hub:
             stands = into.take(fd)
         except OSError:
             stands = False
+        if fd in self._listeners and into.count > first:  # a controller that was held up must not get old news
+            peer = self._peers[fd]
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._listeners.pop(fd) // 2)  # the kernel doubles it
         if not stands:
             self._leave(fd)
         if len(self._peers) > 1 and into.count > first:
             self._spread(into, first, fd)
 
     def _leave(self, fd: int) -> None:
+        self._listeners.pop(fd, None)
         self._sources.remove(fd)
         self._peers.pop(fd).close()
 
@@ -151,6 +160,14 @@ class Hub:
                 os.unlink(self.name)
         except FileNotFoundError:
             pass
+
+
+def _let_wait(peer: socket.socket, size: int) -> None:
+    """Let so many bytes wait for a peer, or what the machine allows of them."""
+    try:
+        peer.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, size)
+    except OSError:
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
 
 
 class SocketCan:
