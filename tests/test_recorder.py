@@ -26,7 +26,8 @@ from rtctl.log.entry import Batch
 from rtctl.log.mcap.recovery import recover_folder
 from rtctl.log.read.info import info
 from rtctl.log.record import ring
-from rtctl.log.record.recorder import Recorder, blob_of, rescue, sweep
+from rtctl.log.record.leftovers import sweep
+from rtctl.log.record.recorder import Recorder, blob_of, rescue
 from rtctl.log.record.writer import Options, Session, segment_path
 
 HEADER = make_header("arm", ("a", "b"), 2, 1e-3, config="x = 1\n", urdf="<robot/>")

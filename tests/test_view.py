@@ -20,6 +20,7 @@ from rtctl.hal.console import Console
 from rtctl.log import make_header, read_run
 from rtctl.log.header import SCENE_FILE, scene_text
 from rtctl.log.record import tap as taps
+from rtctl.log.record.draw import rotation
 from rtctl.log.record.recorder import blob_of
 from rtctl.log.record.requests import encode_event, encode_request
 from rtctl.log.record.ring import attach, create
@@ -36,6 +37,7 @@ from rtctl.view.moment import STATES, STATUSES, Reader, scan_of
 from rtctl.view.operator import LOCKED, Operator
 from rtctl.view.page import Page
 from rtctl.view.shapes import triangles
+from rtctl.view.stage import Stage
 from rtctl.view.words import AMBER, GREEN, RED, bars_html, chart_data, state_html
 from rtctl.world.primitives import distance
 from tests.lab import ROOT
@@ -251,17 +253,44 @@ def test_charts_have_as_many_values_as_times(record: Recorded) -> None:
 # ---- bodies
 
 
+def turned_arm(record: Recorded) -> tuple[Body, Reader, Scene]:
+    """An arm on a base that stands askew, with points on its links; the recorder's own reading of it."""
+    points = [[link, 0.1 * link, -0.05, 0.02 * link, 0.05] for link in range(8)]
+    base = {"position": [0.3, -0.2, 0.1], "wxyz": [0.8, 0.0, 0.0, 0.6]}
+    header = record._header._replace(files={SCENE_FILE: scene_text(points, (), base=base)})
+    reader = Reader(header)
+    return Body(header, reader.base, reader.points), reader, Scene(header)
+
+
+def test_what_hangs_on_the_pages_joints_is_where_the_recorders_own_kinematics_have_it(record: Recorded) -> None:
+    record.seek(1.5)
+    record.step()
+    m = record.story.moment
+    assert m is not None
+    body, reader, other = turned_arm(record)
+    page = Page(record, Operator(None), "127.0.0.1", 0)
+    try:
+        page._server.scene.reset()
+        stage = Stage(page._server, reader, body)
+        stage.draw(record.story)
+        nodes = page._server.scene._handle_from_node_name
+        assert len(stage._spheres) == 8
+        for k, sphere in enumerate(stage._spheres):
+            place, path = np.array(sphere.position), sphere.name
+            while path := path.rpartition("/")[0]:
+                place = rotation(nodes[path].wxyz) @ place + nodes[path].position
+            np.testing.assert_allclose(place, other._point({"q": m.q, "x": m.place}, k), atol=1e-4)
+    finally:
+        page.close()
+
+
 def test_the_arm_drawn_is_where_the_recorders_own_kinematics_have_it(record: Recorded) -> None:
     """Two readings of a URDF: Pinocchio's, and the few lines that the recorder has for 3D viewers."""
     record.seek(1.5)
     record.step()
     m = record.story.moment
     assert m is not None
-    points = [[link, 0.1 * link, -0.05, 0.02 * link, 0.05] for link in range(8)]
-    base = {"position": [0.3, -0.2, 0.1], "wxyz": [0.8, 0.0, 0.0, 0.6]}
-    header = record._header._replace(files={SCENE_FILE: scene_text(points, (), base=base)})
-    reader, other = Reader(header), Scene(header)
-    body = Body(header, reader.base, reader.points)
+    body, _, other = turned_arm(record)
     body.move(m.q)
     assert len(body.points) == 8
     for k in range(len(body.points)):

@@ -12,7 +12,8 @@ from rtctl.app.servo import Servo
 from rtctl.hal.client import default_path
 from rtctl.hal.console import Console
 from rtctl.log.header import Header
-from rtctl.log.record.recorder import CAPACITY, PREFIX, SUFFIX, Stats, blob_of, sweep
+from rtctl.log.record.leftovers import PREFIX, SUFFIX, sweep
+from rtctl.log.record.recorder import CAPACITY, Stats, blob_of
 from rtctl.log.record.ring import attach, create
 from rtctl.types import Request
 

@@ -21,7 +21,7 @@ from rtctl.spec.urdf import package_folders, share_folders
 from rtctl.types import F64, I64
 
 GREY = (205, 208, 214)
-Pose = tuple[F64, tuple[float, float, float, float]]  # position (3,) [m] and wxyz in the world
+Pose = tuple[F64, tuple[float, float, float, float]]  # position (3,) [m] and wxyz
 
 
 class Piece(NamedTuple):
@@ -75,11 +75,13 @@ class Body:
                 self._q[at] = value
         pin.forwardKinematics(self.model, self.data, self._q)
 
-    def pose(self, joint: int, X: F64 | None = None) -> Pose:
-        """Return where a joint's frame, or X (4, 4) in it, is now."""
-        at = self.base @ self.data.oMi[joint].homogeneous
-        at = at if X is None else at @ X
-        return at[:3, 3], quaternion(at[:3, :3])
+    def carried(self) -> list[tuple[int, int]]:
+        """Return the joints, each after the one that carries it, and that one: 0 is the base, which is in the world."""
+        return [(joint, int(self.model.parents[joint])) for joint in range(1, self.model.njoints)]
+
+    def pose(self, joint: int) -> Pose:
+        """Return where a joint's frame is now in that of the joint that carries it; of the base (0) in the world."""
+        return split(self.base if joint == 0 else self.data.liMi[joint].homogeneous)
 
     def reach(self) -> float:
         """Return how far [m] from its base the arm has a part, where it stands now; 1 m for one without parts."""
@@ -99,6 +101,11 @@ class Body:
         joint, local, _ = self.points[index]
         at = self.base @ self.data.oMi[joint].homogeneous
         return np.asarray(at[:3, :3] @ local + at[:3, 3])
+
+
+def split(X: F64) -> Pose:
+    """Return a homogeneous transform (4, 4) as a position and a quaternion."""
+    return X[:3, 3], quaternion(X[:3, :3])
 
 
 def pieces_of(model: pin.Model, header: Header, folder: Path | None) -> list[Piece]:

@@ -12,7 +12,7 @@ from rtctl.log.record.draw import quaternion, rotation
 from rtctl.log.record.surroundings import Thing
 from rtctl.plain import Json
 from rtctl.types import F64
-from rtctl.view.body import Body
+from rtctl.view.body import Body, split
 from rtctl.view.follow import CELL, Story
 from rtctl.view.moment import Moment, Reader
 from rtctl.view.shapes import ball, triangles
@@ -67,8 +67,9 @@ class Stage:
         self._server, self.scene, self.reader, self.body = server, server.scene, reader, body
         self.shown = Shown()
         self._things: dict[str, _Thing] = {}
-        self._parts: list[tuple[SceneNodeHandle, int, F64]] = []
-        self._spheres: list[tuple[SceneNodeHandle, int, F64]] = []
+        self._joints: list[tuple[viser.FrameHandle, int]] = []  # frames, of all joints
+        self._parts: list[SceneNodeHandle] = []
+        self._spheres: list[SceneNodeHandle] = []
         self._arrows: SceneNodeHandle | None = None
         self._poses: dict[str, tuple[float, ...]] = {}  # where nodes were put, by name
         self._frame = 0
@@ -94,25 +95,32 @@ class Stage:
         server.initial_camera.fov = FOV
         server.initial_camera.position, server.initial_camera.look_at = self._camera(WIDE)
         if self.body is not None:
+            names = self._hang(self.body)
             for k, piece in enumerate(self.body.pieces):
+                position, wxyz = split(piece.X)
                 part = scene.add_mesh_simple(
-                    f"/robot/{k}", piece.vertices, piece.faces, color=piece.colour, side="double"
+                    f"{names[piece.joint]}/piece{k}",
+                    piece.vertices,
+                    piece.faces,
+                    color=piece.colour,
+                    side="double",
+                    position=position,
+                    wxyz=wxyz,
                 )
-                self._parts.append((part, piece.joint, piece.X))
+                self._parts.append(part)
             for k, (joint, local, radius) in enumerate(self.body.points):
-                X = np.eye(4)
-                X[:3, 3] = local
                 look = ball(radius, 2)
                 sphere = scene.add_mesh_simple(
-                    f"/spheres/{k}",
+                    f"{names[joint]}/sphere{k}",
                     look.vertices,
                     look.faces,
                     color=SPHERE,
                     opacity=0.35,
                     visible=False,
                     cast_shadow=False,
+                    position=local,
                 )
-                self._spheres.append((sphere, joint, X))
+                self._spheres.append(sphere)
             self.choose(self.shown._replace(spheres=not self.body.pieces))
         else:
             self._base = scene.add_frame("/base", show_axes=False)
@@ -123,6 +131,19 @@ class Stage:
         self._tip = scene.add_icosphere("/tip", 0.008 * big, BEHIND, visible=self.body is not None)
         self._goal = scene.add_icosphere("/goal", 0.014 * big, GOAL, opacity=0.9, visible=False)
         self._lines: dict[str, SceneNodeHandle] = {}
+
+    def _hang(self, body: Body) -> list[str]:
+        """Add a frame for each joint, in that of the joint that carries it; return their names, the base's first.
+
+        What hangs on one is not told where it is: of a joint that turns the page is told the turn alone.
+        """
+        names = ["/robot"]
+        root = self.scene.add_frame(names[0], show_axes=False)
+        root.position, root.wxyz = body.pose(0)
+        for joint, carrier in body.carried():
+            names.append(f"{names[carrier]}/{joint}")
+            self._joints.append((self.scene.add_frame(names[-1], show_axes=False), joint))
+        return names
 
     def face(self, client: viser.ClientHandle, all_of_it: bool = True) -> None:
         """Turn a viewer's camera to the robot, so that the panel hides none of it; of a base to its goal, too."""
@@ -151,9 +172,9 @@ class Stage:
     def choose(self, shown: Shown) -> None:
         """Show what a viewer wants to see."""
         self.shown = shown
-        for part, _, _ in self._parts:
+        for part in self._parts:
             part.visible = shown.meshes
-        for sphere, _, _ in self._spheres:
+        for sphere in self._spheres:
             sphere.visible = shown.spheres
         for thing in self._things.values():
             if thing.shell is not None:
@@ -167,8 +188,8 @@ class Stage:
         self._frame += 1
         if self.body is not None and len(m.q):
             self.body.move(m.q)
-            for part, joint, X in (*self._parts, *(self._spheres if self.shown.spheres else ())):
-                self._put(part, *self.body.pose(joint, X))
+            for frame, joint in self._joints:
+                self._put(frame, *self.body.pose(joint))
         elif self.reader.is_base:
             self._put(self._base, m.place, (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading)))
         moved = m.goal is not None and (self._goal_now is None or float(np.linalg.norm(m.goal - self._goal_now)) > 1.0)
@@ -188,9 +209,12 @@ class Stage:
     def _put(self, node: SceneNodeHandle, place: F64, wxyz: Sequence[float] | F64 = UPRIGHT) -> None:
         """Put a node somewhere, place (3,) [m], unless nobody would see it move: each time costs a message."""
         now = (*(round(float(v), DIGITS) for v in (*place, *wxyz)),)
-        if self._poses.get(node.name) != now:
-            self._poses[node.name] = now
-            node.position, node.wxyz = place, np.asarray(wxyz)
+        before = self._poses.get(node.name, ())
+        self._poses[node.name] = now
+        if before[:3] != now[:3]:
+            node.position = place
+        if before[3:] != now[3:]:
+            node.wxyz = np.asarray(wxyz)
 
     def _obstacles(self, things: dict[str, tuple[Thing, bool]], now: float) -> None:
         for name in [name for name in self._things if name not in things]:

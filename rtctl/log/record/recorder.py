@@ -14,9 +14,8 @@ import select
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -29,13 +28,12 @@ from rtctl.log.mcap.recovery import entries_of, recover, recover_folder
 from rtctl.log.mcap.segment import CHUNK_BYTES, locked
 from rtctl.log.record import ring as rings
 from rtctl.log.record.health import DropWatch
+from rtctl.log.record.leftovers import PREFIX, SUFFIX, rings_in, sweep
 from rtctl.log.record.ring import Consumer, Producer, attach, create
 from rtctl.log.record.writer import Options, Session, segment_path
 from rtctl.trust import TrustError, plain_name
 
 CAPACITY = 32 << 20  # [bytes]: some 8 s of a 7-joint arm at 1 kHz
-PREFIX = "rtctl-"
-SUFFIX = ".ring"
 NAP = 0.02  # [s] between looks at the ring
 READY_TIMEOUT = 60.0  # [s] a process that lives may take that long to come up on a machine that is busy
 LONGEST = 7 * 86400.0  # [s] of a segment
@@ -351,40 +349,13 @@ def rescue(directory: Path | str, folders: Sequence[Path] = ()) -> list[Path]:
     """
     directory = Path(directory).absolute()
     before = set(directory.glob("*.mcap"))
-    for path in _rings(folders):
+    for path in rings_in(folders):
         with contextlib.suppress(LinkError, LogError, TrustError, OSError):
             if _orphan(path, directory):
                 drain(path)
     sweep(folders)
     recover_folder(directory)
     return sorted(set(directory.glob("*.mcap")) - before)
-
-
-def sweep(folders: Sequence[Path] = ()) -> None:
-    """Remove the rings that simulations of this user left when they were killed: no log is of them."""
-    for path in _rings(folders):
-        with contextlib.suppress(LinkError, TrustError, OSError):
-            ring = attach(path)
-            try:
-                left = not ring.producer_alive() and _logless(ring.blob)
-            finally:
-                ring.unmap()
-            if left:
-                path.unlink()
-
-
-def _logless(blob: bytes) -> bool:
-    """Return whether a ring says that no log is made of it; one that says nothing sensible does not."""
-    try:
-        said = json.loads(blob)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(said, dict) and said.get("options") == []
-
-
-def _rings(folders: Sequence[Path]) -> Iterator[Path]:
-    for folder in folders or (rings.SHM, Path(tempfile.gettempdir())):
-        yield from sorted(folder.glob(f"{PREFIX}*{SUFFIX}"))
 
 
 def _orphan(path: Path, directory: Path) -> bool:
