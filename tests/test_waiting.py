@@ -100,12 +100,24 @@ def test_arming_waits_for_a_daemon_that_starts_and_finds_the_one_that_takes_over
         lobby.tell("greeting the drives")
         with Session(place) as asking:
             assert asking.ask({"verb": "status"})["state"] == "STARTING"
-        with Toy(place, lambda request: "", listener=lobby.hand_over()) as toy:
+        with Toy(place, lambda request: "", door=lobby.hand_over()) as toy:
             toy.told["state"] = "RUN"
             arming.join(60.0)
             assert toy.verbs == [Verb.ARM]
     assert codes == [EXIT_OK]
     assert capsys.readouterr().out == "arm: RUN\n"
+
+
+def test_who_called_while_the_daemon_started_is_answered_by_the_one_that_takes_over(place: str) -> None:
+    with Lobby(place, "toy") as lobby, Session(place, 60.0) as caller:
+        assert caller.ask({"verb": "status"})["state"] == "STARTING"
+        door = lobby.hand_over()
+        replies: list[dict[str, Any]] = []
+        asking = threading.Thread(target=lambda: replies.append(caller.ask({"verb": "status"})))
+        asking.start()  # asked before anybody reads
+        with Toy(place, lambda request: "", door=door):
+            asking.join(60.0)
+    assert [reply["state"] for reply in replies] == ["IDLE"]
 
 
 def test_a_daemon_that_ends_while_it_starts_is_told_of(place: str, capsys: Said) -> None:

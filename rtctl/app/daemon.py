@@ -112,8 +112,8 @@ def _run(vehicle: Vehicle[R, M, F, C], setup: Setup[R, M, F, C], how: How) -> in
         start = link.greet(lockstep, _teller(lobby), lambda: signals.count > 0)
         header = setup.header(robot, start, link)
         told = {**header.extra, **surroundings(setup.loop.realtime, link.counters, dry)}
-        listener = lobby.hand_over()  # before the recorder: it is a process of its own
-        console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link), listener=listener)))
+        door = lobby.hand_over()  # before the recorder: it is a process of its own
+        console = stack.enter_context(closing(Console(place, robot.dt, vehicle.bounds(robot, link), door=door)))
         adviser = stack.enter_context(closing(vehicle.adviser(robot, lockstep)))  # a fork: the thread has ended
         recorder = _recorder(setup.log, header._replace(extra=told), how.path)
         servo = Servo(vehicle, robot, link, recorder, start, dry)

@@ -23,7 +23,7 @@ from rtctl import trust
 from rtctl.errors import RequestError, RtctlError
 from rtctl.hal import messages
 from rtctl.hal.client import MESSAGE_MAX
-from rtctl.hal.lobby import PEERS_MAX, listen
+from rtctl.hal.lobby import PEERS_MAX, Door, listen
 from rtctl.hal.messages import Bounds, Notice
 from rtctl.plain import Json
 from rtctl.types import Array, ObstacleEdit, Request
@@ -62,17 +62,17 @@ class Console:
         period: float,
         bounds: Bounds,
         members: Iterable[int] = (),
-        listener: socket.socket | None = None,
+        door: Door | None = None,
     ) -> None:
         """Listen at `path`; serve this user, root and the user ids in `members`.
 
-        `period` [s] of a slot; goals must lie in `bounds`. listener: a socket that listens there already.
+        `period` [s] of a slot; goals must lie in `bounds`. door: who listens there already, and its callers.
         Raises ConfigError when the place is unsafe or taken.
         """
         self.path, self.counts = path, Counter[str]()
         self._period, self._bounds = period, bounds
         self._admitted = frozenset((0, os.geteuid(), *members))
-        self._listener = listener if listener is not None else listen(path)
+        self._listener, callers = door or Door(listen(path))
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)
         self._peers: dict[int, _Peer] = {}
@@ -88,6 +88,8 @@ class Console:
         self._misplaced: PlaceFn = lambda edit: ""
         self._snapshot, self._snapshot_slot = b"", -1
         self._slot = 0
+        for link in callers:
+            self._admit(link)
 
     def publish(self, status: StatusFn, world: StatusFn = dict, misplaced: PlaceFn = lambda edit: "") -> None:
         """Set where snapshots come from, and who judges the place of an obstacle that a person tells of.
@@ -162,6 +164,9 @@ class Console:
             self._send(link, {"ok": False, "error": f"{PEERS_MAX} peers are connected already", "room_in_s": wait})
             link.close()
             return
+        self._admit(link)
+
+    def _admit(self, link: socket.socket) -> None:
         self._peers[link.fileno()] = _Peer(link, self._slot)
         self._epoll.register(link, select.EPOLLIN)
 

@@ -1,7 +1,8 @@
 """The control socket before there is a controller: it says what the start is doing, and refuses everything else.
 
 A thread of its own, for compilation and a handshake hold the main one. It ends before the loop begins: the listening
-socket is handed over to the console, so that no caller finds the door shut in between. Standard library alone.
+socket and the callers are handed over to the console, so that nobody finds the door shut in between, and who has just
+asked is answered. Standard library alone.
 """
 
 import errno
@@ -13,7 +14,7 @@ import stat
 import threading
 from contextlib import suppress
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from rtctl import trust
 from rtctl.errors import ConfigError
@@ -25,6 +26,13 @@ PEERS_MAX = 8
 STARTING = "STARTING"
 
 
+class Door(NamedTuple):
+    """Where callers come in, and those who are in."""
+
+    listener: socket.socket
+    peers: tuple[socket.socket, ...] = ()  # admitted, non-blocking; what they asked last may wait to be read
+
+
 class Lobby:
     """Answers callers while a daemon starts."""
 
@@ -34,6 +42,7 @@ class Lobby:
         self._doing, self._done, self._total = "loading the program", 0, 0
         self._listener: socket.socket | None = listen(path)
         self._bell, self._ear = socket.socketpair()
+        self._peers: list[socket.socket] = []  # the thread's own until it has ended
         self._thread = threading.Thread(target=self._serve, args=(self._listener,), daemon=True)
         self._thread.start()
 
@@ -41,19 +50,21 @@ class Lobby:
         """Set what callers hear: what is being done, and how much of it is done, total 0: nobody knows."""
         self._doing, self._done, self._total = doing, done, total
 
-    def hand_over(self) -> socket.socket:
-        """Return the listening socket, served no more. To be called once."""
+    def hand_over(self) -> Door:
+        """Return the listening socket and the callers, served no more. To be called once."""
         self._end()
         assert self._listener is not None
-        listener, self._listener = self._listener, None
-        return listener
+        door = Door(self._listener, tuple(self._peers))
+        self._listener = None
+        return door
 
     def close(self) -> None:
         """Remove the socket if it was not handed over."""
         if self._listener is None:
             return
         self._end()
-        self._listener.close()
+        for link in (self._listener, *self._peers):
+            link.close()
         self._listener = None
         with suppress(OSError):
             os.unlink(self.path)
@@ -72,19 +83,17 @@ class Lobby:
         self._ear.close()
 
     def _serve(self, listener: socket.socket) -> None:
-        peers: list[socket.socket] = []
+        peers = self._peers
         while True:
             ready = select.select([self._ear, listener, *peers], [], [])[0]
             if self._ear in ready:
-                break
+                return
             if listener in ready:
                 self._accept(listener, peers)
             for peer in [peer for peer in peers if peer in ready]:
                 if not self._answer(peer):
                     peers.remove(peer)
                     peer.close()
-        for peer in peers:
-            peer.close()
 
     @staticmethod
     def _accept(listener: socket.socket, peers: list[socket.socket]) -> None:
