@@ -21,7 +21,7 @@ from rtctl.spec.urdf import package_folders, share_folders
 from rtctl.types import F64, I64
 
 GREY = (205, 208, 214)
-Pose = tuple[F64, tuple[float, float, float, float]]  # position (3,) [m] and wxyz
+Pose = tuple[list[float], list[float]]  # position (3,) [m] and wxyz
 
 
 class Piece(NamedTuple):
@@ -81,7 +81,10 @@ class Body:
 
     def pose(self, joint: int) -> Pose:
         """Return where a joint's frame is now in that of the joint that carries it; of the base (0) in the world."""
-        return split(self.base if joint == 0 else self.data.liMi[joint].homogeneous)
+        if joint == 0:
+            return split(self.base)
+        x, y, z, *turn, w = pin.SE3ToXYZQUAT(self.data.liMi[joint]).tolist()
+        return [x, y, z], [w, *turn]
 
     def reach(self) -> float:
         """Return how far [m] from its base the arm has a part, where it stands now; 1 m for one without parts."""
@@ -105,7 +108,7 @@ class Body:
 
 def split(X: F64) -> Pose:
     """Return a homogeneous transform (4, 4) as a position and a quaternion."""
-    return X[:3, 3], quaternion(X[:3, :3])
+    return X[:3, 3].tolist(), list(quaternion(X[:3, :3]))
 
 
 def pieces_of(model: pin.Model, header: Header, folder: Path | None) -> list[Piece]:

@@ -12,7 +12,7 @@ from rtctl.log.record.draw import quaternion, rotation
 from rtctl.log.record.surroundings import Thing
 from rtctl.plain import Json
 from rtctl.types import F64
-from rtctl.view.body import Body, split
+from rtctl.view.body import Body, Pose, split
 from rtctl.view.follow import CELL, Story
 from rtctl.view.moment import Moment, Reader
 from rtctl.view.shapes import ball, triangles
@@ -71,7 +71,7 @@ class Stage:
         self._parts: list[SceneNodeHandle] = []
         self._spheres: list[SceneNodeHandle] = []
         self._arrows: SceneNodeHandle | None = None
-        self._poses: dict[str, tuple[float, ...]] = {}  # where nodes were put, by name
+        self._poses: dict[str, Pose] = {}  # where nodes were put, by name
         self._frame = 0
         self._place: F64 = np.zeros(3)  # [m] of the moment that is drawn
         self._goal_now: F64 | None = None
@@ -104,8 +104,8 @@ class Stage:
                     piece.faces,
                     color=piece.colour,
                     side="double",
-                    position=position,
-                    wxyz=wxyz,
+                    position=np.array(position),
+                    wxyz=np.array(wxyz),
                 )
                 self._parts.append(part)
             for k, (joint, local, radius) in enumerate(self.body.points):
@@ -139,7 +139,7 @@ class Stage:
         """
         names = ["/robot"]
         root = self.scene.add_frame(names[0], show_axes=False)
-        root.position, root.wxyz = body.pose(0)
+        self._put(root, *body.pose(0))
         for joint, carrier in body.carried():
             names.append(f"{names[carrier]}/{joint}")
             self._joints.append((self.scene.add_frame(names[-1], show_axes=False), joint))
@@ -191,30 +191,30 @@ class Stage:
             for frame, joint in self._joints:
                 self._put(frame, *self.body.pose(joint))
         elif self.reader.is_base:
-            self._put(self._base, m.place, (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading)))
+            self._put(self._base, m.place.tolist(), (math.cos(0.5 * m.heading), 0.0, 0.0, math.sin(0.5 * m.heading)))
         moved = m.goal is not None and (self._goal_now is None or float(np.linalg.norm(m.goal - self._goal_now)) > 1.0)
         self._place, self._goal_now = m.place, m.goal
         if moved and self.reader.is_base:  # a new goal: the whole trip is shown
             for client in self._server.get_clients().values():
                 self.face(client)
-        self._put(self._tip, m.place)
+        self._put(self._tip, m.place.tolist())
         self._goal.visible = m.goal is not None
         if m.goal is not None:
-            self._put(self._goal, m.goal)
+            self._put(self._goal, m.goal.tolist())
         self._obstacles(story.things, m.time)
         self._forces(m)
         if self._frame % SLOW == 1:
             self._ways(story, m)
 
-    def _put(self, node: SceneNodeHandle, place: F64, wxyz: Sequence[float] | F64 = UPRIGHT) -> None:
+    def _put(self, node: SceneNodeHandle, place: Sequence[float], wxyz: Sequence[float] = UPRIGHT) -> None:
         """Put a node somewhere, place (3,) [m], unless nobody would see it move: each time costs a message."""
-        now = (*(round(float(v), DIGITS) for v in (*place, *wxyz)),)
-        before = self._poses.get(node.name, ())
-        self._poses[node.name] = now
-        if before[:3] != now[:3]:
-            node.position = place
-        if before[3:] != now[3:]:
-            node.wxyz = np.asarray(wxyz)
+        at, turned = [round(v, DIGITS) for v in place], [round(v, DIGITS) for v in wxyz]
+        before = self._poses.get(node.name, ([], []))
+        self._poses[node.name] = at, turned
+        if before[0] != at:
+            node.position = np.array(place)
+        if before[1] != turned:
+            node.wxyz = np.array(wxyz)
 
     def _obstacles(self, things: dict[str, tuple[Thing, bool]], now: float) -> None:
         for name in [name for name in self._things if name not in things]:
@@ -229,7 +229,7 @@ class Stage:
             elapsed = max(0.0, now - thing.time)
             velocity, omega = np.array(told["velocity"], np.float64), np.array(told["omega"], np.float64)
             place = np.array(told["position"], np.float64) + elapsed * velocity
-            self._put(have.frame, place, _turned(told["wxyz"], omega * elapsed))
+            self._put(have.frame, place.tolist(), _turned(told["wxyz"], omega * elapsed))
 
     def _thing(self, name: str, thing: Thing, is_fixed: bool) -> _Thing:
         frame = self.scene.add_frame(f"/obstacles/{name}", show_axes=False)

@@ -83,9 +83,14 @@ class Tap(Ring):
         return bytes(self.map[tick[0] : tick[1]]), messages
 
     @property
+    def closed(self) -> bool:
+        """Return whether the producer said that nothing more will come."""
+        return bool(self.words[rings.CLOSED])
+
+    @property
     def ended(self) -> bool:
         """Return whether nothing more will come: the producer said so, or is gone."""
-        return bool(self.words[rings.CLOSED]) or not self.producer_alive()
+        return self.closed or not self.producer_alive()
 
 
 def living(robot: str = "") -> list[Path]:
