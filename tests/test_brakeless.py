@@ -3,6 +3,7 @@
 The arm is the OpenArm as its maker ships it. The oracle is the plant: its joints' true speeds, its tip's true way.
 """
 
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -97,6 +98,34 @@ def test_joints_whose_drive_hears_and_whose_encoder_is_true_are_held_then_lowere
     assert found.largest(list(range(7)), SOON) < HELD
     assert found.speed[found.t[1:] > SOON].max() < LOWERED
     assert found.tip[-1, 2] < found.tip[0, 2] - 0.03  # it is on its way down
+
+
+def test_a_stop_is_predicted_with_the_friction_that_the_file_tells(tmp_path: Path) -> None:
+    """Oracle: the plant's accelerations, as torques of each joint's inertia, beside those that the filter is told."""
+    coulomb = np.array([1.0, 1.0, 1.0, 1.0, 0.2, 0.2, 0.2])  # [Nm]
+    text = OPENARM.read_text().replace('"openarm.urdf"', f'"{OPENARM.with_suffix(".urdf")}"')
+    each = iter(coulomb.tolist())
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        re.sub(r"(drive = [^}]*?) }", lambda m: f"{m[1]}, friction = {{ coulomb_Nm = {next(each)} }} }}", text)
+    )
+    missed: list[F64] = []
+    with lab(path=path, scenario={"plant": {"coulomb_Nm": coulomb.tolist()}}, inject=("silent@0.6:0:0.05",)) as here:
+        here.running()
+        here.ask(GOAL)
+        while here.memory.state == State.RUN:
+            here.step()
+        before = here.simulator.truth().qd
+        for _ in range(250):
+            predicted, inertia = here.memory.qdd, here.memory.model.A.diagonal()
+            here.step()
+            now = here.simulator.truth().qd
+            slides = np.abs(before) > 0.1  # [rad/s]
+            missed.append(np.where(slides, inertia * ((now - before) / here.robot.dt - predicted) / coulomb, 0.0))
+            before = now
+        said = [detail for _, name, detail in here.servo.events if name == "fault"]
+    assert np.median(np.abs(missed)[np.array(missed) != 0.0]) < 0.2  # of the friction; without it all of it
+    assert not any("innovation" in detail for detail in said)
 
 
 @pytest.mark.parametrize(("newton", "direction"), [(60.0, (1.0, 0.0, 0.0)), (150.0, (0.0, 0.0, -1.0))])

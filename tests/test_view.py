@@ -541,8 +541,9 @@ def used(chrome: browser.Browser, page: Page) -> None:
     chrome.run(f"{press.format('Stop')}.click()")
     chrome.wait("document.body.innerText.includes('stop: accepted')")
     assert not chrome.run(f"return {press.format('Arm')}")
-    chrome.run("document.querySelector('input[type=checkbox]:not([id^=mantine])').click()")  # those are viser's own
-    chrome.wait(press.format("Arm"))
+    unlock = "document.querySelector('input[type=checkbox]:not([id^=mantine])')"  # those are viser's own
+    # pressed again where it was not taken: a page that is drawn anew meanwhile loses a click
+    chrome.wait(f"{press.format('Arm')} || ({unlock}.checked || {unlock}.click(), false)")
     chrome.run(f"{press.format('Arm')}.click()")
     chrome.wait("document.body.innerText.includes('arm: accepted')")
     chrome.drawn()

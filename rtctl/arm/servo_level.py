@@ -188,7 +188,7 @@ def _sense(c: RecordRow, m: RecordRow, f: Feedback, model: Model, Jbar: F64, aro
 
 
 @kernel
-def held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surroundings) -> tuple[int, F64]:
+def held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, Jbar: F64, around: Surroundings) -> tuple[int, F64]:
     """Have the drives hold or lower the arm by their own loops; return types.Drive and the torque (n,) they give."""
     n, noticed = f.q.shape[0], m.noticed != 0
     own_loop(c, m, f, model, around, model.g - m.lasting[:n] if noticed else model.g)
@@ -198,6 +198,7 @@ def held(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surround
     if m.off != 0:
         return _DISABLE, tau
     g = model.g - m.external[:n] if noticed else model.g
+    g = g + known_friction(c, m, model, Jbar)
     m.qdd[:n] = acceleration(model.A_inv, tau, model.h, g, c.viscous[:n].copy(), m.qd[:n].copy())
     return _HOLD, tau
 
@@ -298,7 +299,7 @@ def act(
     if ahead.leads:  # and when it ends the tip goes on as it is
         m.v_ref[:], m.w_ref[:], m.lead[:n] = xd, omega, ahead.reference
     if holds_itself(c, m):
-        command, tau_wanted = held(c, m, f, model, around)
+        command, tau_wanted = held(c, m, f, model, space.Jbar, around)
     else:
         command, tau_wanted = limited(c, m, f, model, space.Jbar, torques)
     pursued = target_of(m, m.has_goal != 0 and m.state == _RUN)
