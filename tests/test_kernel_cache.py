@@ -167,3 +167,14 @@ def test_as_many_kernels_are_announced_as_there_are_decorated_functions():
     functions = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     names = [d.id for function in functions for d in function.decorator_list if isinstance(d, ast.Name)]
     assert warm.kernels() == sum(name.endswith("kernel") for name in names)
+
+
+def test_a_kernel_loads_no_linear_algebra_of_scipy_and_one_that_asks_for_it_has_it() -> None:
+    script = (
+        "import sys, numpy, numba; from rtctl.kernel.reductions import norm; length = norm(numpy.ones(4));"
+        "before = 'scipy.linalg' in sys.modules; twice = numba.njit(lambda A: A @ A)(2.0 * numpy.eye(2));"
+        "print(length, before, twice.tolist(), 'scipy.linalg' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split(" ", 2)[:2] == ["2.0", "False"]
+    assert done.stdout.strip().endswith("[[4.0, 0.0], [0.0, 4.0]] True")

@@ -1,7 +1,9 @@
 """The servo level's compiled code: one decorator for all kernels, and the mathematics that they share."""
 
+import sys
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from typing import Literal, ParamSpec, Protocol, TypeVar, cast
 
 from numba import njit, typeof
@@ -10,6 +12,24 @@ from rtctl.kernel.cache import install
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+
+def _without_lapack() -> None:
+    """Have numba loaded as if SciPy's LAPACK were not there.
+
+    It looks for that when it compiles or loads its first function, for convolutions alone, which no kernel has; to
+    load SciPy takes as long as numba itself. A function that multiplies matrices by BLAS finds it later all the same.
+    """
+    name, modules = "scipy.linalg.cython_blas", cast(dict[str, object], sys.modules)
+    if name not in modules:
+        modules[name] = None  # an import of it fails
+        try:
+            import_module("numba.np.arraymath")
+        finally:
+            del modules[name]
+
+
+_without_lapack()
 
 
 def kernel(function: Callable[_P, _R]) -> Callable[_P, _R]:
