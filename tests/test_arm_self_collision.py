@@ -1,6 +1,7 @@
 """The arm against itself: distances against the meshes themselves, slopes by differences, forces by hand."""
 
 from functools import cache
+from pathlib import Path
 
 import coal
 import numpy as np
@@ -11,7 +12,7 @@ from rtctl.arm.apart import hulls_apart
 from rtctl.arm.field import CAPPED, CONTACT, field_params, own_field
 from rtctl.arm.model import RigidBody
 from rtctl.arm.self_collision import Own, nothing
-from rtctl.design import pairs
+from rtctl.design import kept, pairs
 from rtctl.design.pairs import hulls_of, watched
 from rtctl.types import F64
 from tests.arms import NO_POINTS, PANDA_HOME, panda
@@ -223,3 +224,15 @@ def test_contact_is_flagged_bounded_and_still_pushed_apart(rho: float) -> None:
     tau, _, flags = own_field(np.array([rho]), ROW, np.zeros(3), np.zeros(3), A_INV, UNDAMPED, NO_ENDS)
     assert flags == (CAPPED if rho > 0.0 else CAPPED | CONTACT)
     assert ROW[0] @ A_INV @ tau == pytest.approx(push(PARAMS.rho_num), rel=1e-5)
+
+
+def test_what_was_found_of_pairs_before_is_kept_and_found_anew_for_another_arm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path)
+    limits = panda().limits
+    first = watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, CLEARANCE, REACH)
+    monkeypatch.setattr(pairs, "_meet", None)  # it is not asked again
+    assert watched(panda(), limits.q_min, limits.q_max, PANDA_HOME, CLEARANCE, REACH).names == first.names
+    with pytest.raises(TypeError):
+        watched(panda(), limits.q_min, 0.9 * limits.q_max, PANDA_HOME, CLEARANCE, REACH)

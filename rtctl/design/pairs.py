@@ -1,12 +1,15 @@
 """Which links of an arm can meet: hulls of the collision geometry, and the pairs worth measuring at run time."""
 
+from importlib.metadata import version
+
 import coal
 import numpy as np
 
 from rtctl.arm.model import RigidBody
 from rtctl.arm.self_collision import Hull, Own
+from rtctl.design import kept
 from rtctl.design.solids import solids_of
-from rtctl.types import F64
+from rtctl.types import B1, F64, I64
 
 POSTURES = 2000  # sampled within the joint limits to see which links can meet
 CROOK = 0.1  # [m] links two joints apart and nearer than this at home are not watched: see `watched`
@@ -51,17 +54,31 @@ def watched(body: RigidBody, q_min: F64, q_max: F64, q_home: F64, clearance: flo
         for i, far in enumerate(hulls)
         if far.link > near.link and body.parent[far.link] != near.link
     ]
-    every = Own(hulls, np.array(pairs, np.int64).reshape(-1, 2), SAFE)
-    home = Own(hulls, every.pairs, CROOK)
+    indices = np.array(pairs, np.int64).reshape(-1, 2)
     samples = np.random.default_rng(0).uniform(q_min, q_max, (POSTURES, body.n))
+    links = np.array([h.link for h in hulls], np.int64)
+    told: list[F64 | I64] = [q_home, samples, indices, links, body.parent, *(h.corners for h in hulls)]
+    told += [part for q in (q_home, *samples[:3]) for part in body.placements(q)]  # the chain, by what it does
+    path = kept.place_of("pairs", f"coal {version('coal')} {clearance!r}", told, __name__, __file__)
+    said = (kept.known(path) or {}).get("watched")
+    if not isinstance(said, list) or len(said) != len(pairs):
+        said = _meet(body, hulls, indices, samples, q_home, clearance).tolist()
+        kept.note(path, {"watched": said})
+    return Own(hulls, np.ascontiguousarray(indices[np.array(said, np.bool_)]), reach)
+
+
+def _meet(body: RigidBody, hulls: list[Hull], pairs: I64, samples: F64, q_home: F64, clearance: float) -> B1:
+    """Return which pairs (L, 2) meet in one of the samples (b, n) [rad], and are to be watched."""
+    every, home = Own(hulls, pairs, SAFE), Own(hulls, pairs, CROOK)
     meets = np.zeros(len(pairs), np.bool_)
     elbow = np.array([body.parent[body.parent[hulls[i].link]] == hulls[j].link for i, j in pairs], np.bool_)
-    near = Own(hulls, every.pairs[elbow], SAFE_NEAR)
+    near = Own(hulls, pairs[elbow], SAFE_NEAR)
     meets_near = np.zeros(int(elbow.sum()), np.bool_)
     for q in samples:
-        every.meet(*body.placements(q), meets)
-        near.meet(*body.placements(q), meets_near)
+        placements = body.placements(q)
+        every.meet(*placements, meets)
+        near.meet(*placements, meets_near)
     meets[elbow] = meets_near
     at_home = body.own_distances(q_home, home)
-    keep = meets & ~(at_home < clearance) & ~(elbow & (at_home < CROOK))
-    return Own(hulls, np.ascontiguousarray(every.pairs[keep]), reach)
+    keep: B1 = meets & ~(at_home < clearance) & ~(elbow & (at_home < CROOK))
+    return keep
