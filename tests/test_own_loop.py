@@ -685,3 +685,23 @@ def test_what_the_drives_give_by_their_loops() -> None:
 def test_every_kernel_of_it_is_tried() -> None:
     names = {name for name, f in vars(module).items() if inspect.isfunction(f) and f.__module__ == module.__name__}
     assert len(names) == 12
+
+
+@pytest.mark.parametrize("lost", [0, 2, 5, 10])
+def test_joints_that_are_let_go_are_taken_to_give_nothing(lost: int) -> None:
+    c, m, _ = random_arm(lost)
+    m.lost = lost
+    q, qd, p, v = m.q[:4], m.qd[:4], m.own_p[:4], m.own_v[:4]
+    gives = np.clip(50.0 * (p - q) + 1.0 * (v - qd) + m.own_t[:4], -20.0, 20.0)
+    falls = [bool(lost >> i & 1) for i in range(4)]
+    np.testing.assert_allclose(module.given(c, m, 4), np.where(falls, 0.0, gives))
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_a_joint_whose_encoder_begins_to_lie_in_a_stop_is_let_go_in_the_same_tick(i: int) -> None:
+    c, q, qd = constants(), np.array([0.5, 0.6]), np.array([0.2, -0.1])
+    m, model = memory(q, qd, np.array([1.0, 2.0])), model_of(q, qd)
+    m.encoder_monitors[BEYOND, i] = DISAGREE_TICKS
+    module.own_loop(c, m, healthy(q, 0, DT), model, around(), model.g)
+    assert (m.no_speed, m.lost) == (1 << i, 1 << i)
+    assert m.own_kd[:2].tolist() == [0.0 if k == i else c.stop_kd[k] for k in range(2)]

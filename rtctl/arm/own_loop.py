@@ -191,11 +191,11 @@ def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F6
         for i in range(n):
             moves = moves or u[i] != 0.0
         if moves and _obstructed(c, m, around, u):
-            u[:], since = 0.0, 0.0  # it is held there
+            u[:] = 0.0  # it is held there
         elif not moves or since > LOWERED:
-            m.own_phase, m.own_since, since = SINKING, m.tick, 0.0
+            m.own_phase, m.own_since = SINKING, m.tick
     elif m.own_phase == BRAKING and since >= HOLD_TIME:
-        m.own_phase, m.own_since, since = LOWERING, m.tick, 0.0
+        m.own_phase, m.own_since = LOWERING, m.tick
     for i in range(n):
         rate = JOINT_SPEED / GATHER if m.own_phase != BRAKING else _braking(c, m, i)
         most = max(_ahead(c, m, i, u[i]), 0.0) / GATHER  # it comes to its limit softly
@@ -207,7 +207,7 @@ def _go_on(c: RecordRow, m: RecordRow, model: Model, around: Surroundings, g: F6
         if m.own_p[i] != p:
             m.own_v[i] = 0.0
     if m.own_phase == SINKING:
-        fade = math.exp(-SINK_RATE * c.dt)
+        fade, since = math.exp(-SINK_RATE * c.dt), (m.tick - m.own_since) * c.dt
         for i in range(n):
             m.own_kp[i], m.own_g[i] = fade * m.own_kp[i], fade * m.own_g[i]
         if since >= SINK_LATEST or (since >= SINK_TIME and m.rest * c.dt >= RESTS):
