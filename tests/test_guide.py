@@ -5,6 +5,7 @@ import signal
 import time
 from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,15 +13,16 @@ import pytest
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
-from rtctl.app.postures import SLOTS, STEP, endings, inertia_of, previewed, site_of, skin_of
+from rtctl.app.postures import SLOTS, STEP, endings, inertia_of, links_keep, previewed, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
 from rtctl.arm.field import APART, Ends, MovingPoints, field_buffers, field_to
 from rtctl.arm.freedom import Room, body_of, first_blocked
-from rtctl.arm.kinematics import chain_of, placements, points_at, tip_at
+from rtctl.arm.kinematics import chain_of, clearance_of, placements, points_at, tip_at
 from rtctl.arm.memory import MEASURED_POSTURE, Memory
 from rtctl.arm.pipe import initial
+from rtctl.design.pairs import hulls_of
 from rtctl.kernel.rotations import quat_of
 from rtctl.log import schema
 from rtctl.log.read.run import read_run
@@ -189,6 +191,31 @@ def test_where_points_stand_out_too_far_the_links_themselves_are_measured():
         assert is_free[1] or true < keep + 0.01
         gained += is_free[1] and not is_free[0]
     assert gained > 0
+
+
+def test_links_keep_a_clearance_where_their_hulls_do_to_a_millimetre():
+    """Balls and boxes beside some link, near enough for its skin not to tell whether the links keep 8 mm; by coal."""
+    arm, rng, q = robot(), np.random.default_rng(4), np.array(HOME)
+    arm = arm._replace(avoid=arm.avoid._replace(rho_min=0.008))
+    R, t = arm.body.placements(q)
+    hulls = [(hull.shape, coal.Transform3s(R[hull.link], t[hull.link])) for hull in hulls_of(arm.body) if hull.link]
+    skin, tried, kept = skin_of(arm.body), 0, 0
+    P = arm.body.placed(q, skin)
+    while tried < 30:
+        place = P[int(rng.integers(len(P)))] + rng.uniform(-0.07, 0.07, 3)
+        is_ball, size = bool(rng.integers(2)), np.array([0.03, 0.04, 0.05, 0.0])
+        thing = ball(place) if is_ball else Shape("ball", "box", size, place, UNIT, np.zeros(3), np.zeros(3))
+        site = site_of(arm, around(thing), q)
+        if not 0.003 < clearance_of(site.chain, skin, q[None], site.obstacles)[0] < 0.008:
+            continue
+        form, pose = coal.Sphere(0.05) if is_ball else coal.Box(0.06, 0.08, 0.1), coal.Transform3s(np.eye(3), place)
+        asked = coal.DistanceRequest()
+        true = min(coal.distance(hull, X, form, pose, asked, coal.DistanceResult()) for hull, X in hulls)
+        keeps = links_keep(site, q)
+        assert not keeps or true > 0.008 - 1e-5
+        assert keeps or true < 0.008 + 1e-3
+        tried, kept = tried + 1, kept + keeps
+    assert 5 < kept < 30
 
 
 def test_what_is_far_is_left_out_of_a_look_and_nothing_else():

@@ -18,7 +18,8 @@ from rtctl.arm.robot import Robot
 from rtctl.design.solids import solids_of, surface
 from rtctl.plain import Json
 from rtctl.types import B1, F64, I64, Goal
-from rtctl.world.primitives import Obstacles, advance
+from rtctl.world.primitives import Obstacles, advance, distances_into
+from rtctl.world.rooms import count_rooms, farthest
 
 SEEDS = 48  # random starts
 ENDS = 8  # postures returned at most
@@ -26,6 +27,7 @@ ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
 HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
+FINE, HALVINGS = 5e-4, 5  # [m] the same where it is looked at once more, and how often triangles are divided for that
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
 SLOTS = Obstacles._fields[:10]  # what there is of each obstacle; the rest are bodies that they share
@@ -119,12 +121,59 @@ def skin_of(body: RigidBody) -> Points:
 
 def links_clear(site: Site, Q: F64, rho: F64) -> B1:
     """Return in which postures (b, n) the links keep the clearance, by their skin; rho (b,) [m] of the points there."""
-    robot = site.robot
-    out: B1 = rho >= robot.avoid.rho_min
+    robot, keep = site.robot, site.robot.avoid.rho_min
+    out: B1 = rho >= keep
     near = np.flatnonzero(~out & (rho > 0.0))
     if len(near) and len(site.obstacles.active):
-        out[near] = clearance_of(site.chain, skin_of(robot.body), Q[near], site.obstacles) >= robot.avoid.rho_min
+        links = clearance_of(site.chain, skin_of(robot.body), Q[near], site.obstacles)
+        out[near] = links >= keep
+        for k in near[(links < keep) & (links > keep - SKIN)]:
+            out[k] = links_keep(site, Q[k])
     return out
+
+
+@cache
+def facets_of(body: RigidBody) -> tuple[I64, F64]:
+    """Return the triangles of the links' surface: the link (t,) and the corners (t, 3, 3) [m] of each in its frame."""
+    solids = [s for s in solids_of(body) if s.link > 0]
+    corners = [samples[triangles] for samples, triangles in (surface(s, SKIN * np.sqrt(3.0)) for s in solids)]
+    return np.repeat([s.link for s in solids], [len(each) for each in corners]), np.concatenate(corners)
+
+
+def links_keep(site: Site, q: F64) -> bool:
+    """Return whether the links keep the clearance at a posture q (n,), to FINE.
+
+    A triangle whose ball about its middle keeps it does; one whose middle does not, does not; others are divided.
+    """
+    keep, (link, corners) = site.robot.avoid.rho_min, facets_of(site.robot.body)
+    for _ in range(HALVINGS):
+        middle = corners.mean(axis=1)
+        radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+        near = _distances(site, q, Points(link, middle, radius, ())) < keep
+        if not near.any():
+            return True
+        link, corners, middle, radius = link[near], corners[near], middle[near], radius[near]
+        if (_distances(site, q, Points(link, middle, np.minimum(radius, FINE), ())) < keep).any():
+            return False
+        link, corners = np.repeat(link, 4), _quartered(corners)
+    return False
+
+
+def _quartered(corners: F64) -> F64:
+    """Return the triangles (4 t, 3, 3) that triangles (t, 3, 3) consist of, divided at the middles of their edges."""
+    between = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    a, b, c = (np.stack([corners[:, k], between[:, k], between[:, k - 1]], axis=1) for k in range(3))
+    return np.stack([a, b, c, between], axis=1).reshape(-1, 3, 3)
+
+
+def _distances(site: Site, q: F64, points: Points) -> F64:
+    """Return the distance (m,) [m] of each point to the obstacles, as `clearance_of` counts it."""
+    o, P = site.obstacles, np.ascontiguousarray(site.robot.body.placed(q, points).T)
+    rho = np.empty((len(o.active), 4, len(points.link)))
+    distances_into(P, points.radius, o, farthest(o.room, o.active, 2.0 * site.robot.avoid.rho_min), rho)
+    count_rooms(o.room, rho)
+    least: F64 = rho[:, 0].min(axis=0, initial=np.inf)
+    return least
 
 
 def _cost(site: Site, q: F64, rho: float) -> float:

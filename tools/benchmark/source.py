@@ -35,7 +35,7 @@ GOAL_AT = 0.3  # [s]
 LASTS = 20.0  # [s] within which it must arrive
 # Shelves and boxes leave the hand less than the shipped files' 20 mm, and their points stand out of links too far;
 # slower, for the shorter influence.
-CLEARANCE, INFLUENCE, SPEED, OVERHANG = 0.008, 0.05, 0.3, 0.015  # [m], [m], [m/s], [m]
+CLEARANCE, INFLUENCE, SPEED, OVERHANG = 0.005, 0.05, 0.3, 0.010  # [m], [m], [m/s], [m]
 CONFIG: dict[tuple[str, ...], object] = {
     ("avoid", "clearance_m"): CLEARANCE,
     ("avoid", "influence_m"): INFLUENCE,
