@@ -52,7 +52,7 @@ def test_the_goal_is_the_tips_pose_and_what_is_grasped_is_left_out(tmp_path: Pat
     assert table["start_q_rad"] == HOME
     assert table["goal"][0]["position_m"] == pytest.approx(tip.x, abs=1e-9)
     assert [o["name"] for o in table["obstacle"]] == ["shelf"]
-    assert config.avoid.clearance_m == 0.008
+    assert config.avoid.clearance_m == 0.005
     R, t = foot(robot, "panda_link0")
     assert np.allclose(R, np.eye(3))
     assert np.allclose(t, 0.0)

@@ -195,6 +195,7 @@ class Guide:
         if straight is not None:
             return self._led(m, goal, site, straight)
         if not self.ends:
+            self._expect(m, self._tip_takes(site, goal))  # other starts may find some, though nothing holds the arm yet
             return self._planned(m, goal, site) if not there and self.plans else None
         self.given = self.ends[0]
         planned = self._sooner(m, goal, site, Q) if there else self._planned(m, goal, site) if self.plans else None
