@@ -20,6 +20,7 @@ from rtctl.app.postures import (
     free_of_all,
     inertia_of,
     links_clear,
+    links_keep,
     own_room,
     packed,
     previewed,
@@ -91,6 +92,7 @@ def warm(robot: Robot) -> None:
     endings(site, goal, 0, seeds=1)
     previewed(site, goal, robot.q_rest, inertia_of(site), robot.avoid.rho_min)
     links_clear(swept(site, (0.1,)), robot.home[None], np.array([1e-3]))
+    links_keep(site, robot.home)
     heading(site, way_of(site, np.array([robot.home, robot.q_rest + 0.1])), 0, True)
     plan.warm(site)
 

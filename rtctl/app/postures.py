@@ -27,7 +27,7 @@ ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
 HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
-FINE, HALVINGS = 5e-4, 5  # [m] the same where it is looked at once more, and how often triangles are divided for that
+FINE = 5e-4  # [m] the same where pieces of their surface are divided
 STEP = 0.05  # [s] of a rollout
 TURN = 2.0 * np.pi
 SLOTS = Obstacles._fields[:10]  # what there is of each obstacle; the rest are bodies that they share
@@ -111,52 +111,51 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
 
 
 @cache
+def _surface_of(body: RigidBody) -> tuple[Points, I64]:
+    solids = [s for s in solids_of(body) if s.link > 0]
+    parts = [surface(s, SKIN * np.sqrt(3.0)) for s in solids]  # a triangle's points are within edge/sqrt(3) of a corner
+    firsts = np.cumsum([0, *(len(samples) for samples, _ in parts)])
+    link = np.repeat([s.link for s in solids], np.diff(firsts)).astype(np.int64)
+    skin = Points(link, np.concatenate([samples for samples, _ in parts]), np.full(len(link), SKIN), ())
+    return skin, np.concatenate([first + triangles for first, (_, triangles) in zip(firsts[:-1], parts, strict=True)])
+
+
 def skin_of(body: RigidBody) -> Points:
     """Return balls about samples of the links' surface that cover it, and stand out of it by their radius at most."""
-    solids = [s for s in solids_of(body) if s.link > 0]
-    samples = [surface(s, SKIN * np.sqrt(3.0))[0] for s in solids]  # a triangle's points are within edge/sqrt(3) of one
-    link = np.repeat([s.link for s in solids], [len(each) for each in samples]).astype(np.int64)
-    return Points(link, np.concatenate(samples), np.full(len(link), SKIN), ())
+    return _surface_of(body)[0]
 
 
 def links_clear(site: Site, Q: F64, rho: F64) -> B1:
-    """Return in which postures (b, n) the links keep the clearance, by their skin; rho (b,) [m] of the points there."""
-    robot, keep = site.robot, site.robot.avoid.rho_min
+    """Return in which postures (b, n) the links keep the clearance; rho (b,) [m] of the points there."""
+    keep = site.robot.avoid.rho_min
     out: B1 = rho >= keep
     near = np.flatnonzero(~out & (rho > 0.0))
     if len(near) and len(site.obstacles.active):
-        links = clearance_of(site.chain, skin_of(robot.body), Q[near], site.obstacles)
+        links = clearance_of(site.chain, skin_of(site.robot.body), Q[near], site.obstacles)
         out[near] = links >= keep
         for k in near[(links < keep) & (links > keep - SKIN)]:
             out[k] = links_keep(site, Q[k])
     return out
 
 
-@cache
-def facets_of(body: RigidBody) -> tuple[I64, F64]:
-    """Return the triangles of the links' surface: the link (t,) and the corners (t, 3, 3) [m] of each in its frame."""
-    solids = [s for s in solids_of(body) if s.link > 0]
-    corners = [samples[triangles] for samples, triangles in (surface(s, SKIN * np.sqrt(3.0)) for s in solids)]
-    return np.repeat([s.link for s in solids], [len(each) for each in corners]), np.concatenate(corners)
-
-
 def links_keep(site: Site, q: F64) -> bool:
     """Return whether the links keep the clearance at a posture q (n,), to FINE.
 
-    A triangle whose ball about its middle keeps it does; one whose middle does not, does not; others are divided.
+    A piece of their surface whose ball keeps it does; one whose middle does not, does not; others are divided.
     """
-    keep, (link, corners) = site.robot.avoid.rho_min, facets_of(site.robot.body)
-    for _ in range(HALVINGS):
+    keep, (skin, triangles) = site.robot.avoid.rho_min, _surface_of(site.robot.body)
+    rho = _distances(site, q, skin)
+    pieces = triangles[(rho < keep)[triangles].any(axis=1)]
+    link, corners = skin.link[pieces[:, 0]], skin.local[pieces]
+    while len(link):
         middle = corners.mean(axis=1)
         radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
         near = _distances(site, q, Points(link, middle, radius, ())) < keep
-        if not near.any():
-            return True
         link, corners, middle, radius = link[near], corners[near], middle[near], radius[near]
         if (_distances(site, q, Points(link, middle, np.minimum(radius, FINE), ())) < keep).any():
             return False
         link, corners = np.repeat(link, 4), _quartered(corners)
-    return False
+    return True
 
 
 def _quartered(corners: F64) -> F64:
