@@ -20,7 +20,7 @@ from rtctl.app.arm_link import first_feedback
 from rtctl.app.sim import simulate
 from rtctl.arm.law import prepared
 from rtctl.arm.memory import Memory
-from rtctl.arm.pipe import initial, tick, warm
+from rtctl.arm.pipe import compile_part, initial, tick, warm
 from rtctl.hal.clock import lockstep
 from rtctl.hal.messages import Bounds, decode, request_of
 from rtctl.kernel.rotations import quat_of
@@ -117,6 +117,11 @@ def test_the_tick_reads_no_clock_no_file_and_no_chance(monkeypatch: pytest.Monke
     got = tick(robot(), memory, feedback, request)
     monkeypatch.undo()
     assert same(got, wanted)
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_what_two_processes_compile_ahead_has_the_arguments_of_now(part: int) -> None:
+    compile_part(robot(), part)
 
 
 def test_warming_compiles_all_that_a_run_needs():

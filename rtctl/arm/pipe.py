@@ -343,7 +343,7 @@ def compile_part(robot: Robot, part: int) -> None:
         compile_for(act, robot.arm, m, model, space, around, feedback, Asked(0, 0, 0), memory.ends)
         return
     compile_for(limited, robot.arm.constants[0], m, feedback, model, space.Jbar, np.zeros((KEEP + 1, robot.n)))
-    compile_for(held, robot.arm.constants[0], m, feedback, model, around)
+    compile_for(held, robot.arm.constants[0], m, feedback, model, space.Jbar, around)
 
 
 def warm(robot: Robot) -> None:
