@@ -29,6 +29,7 @@ ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # of the WebDriver standard
 
 DRAWN = """(() => {
   const scene = document.querySelector("canvas[data-engine]"), small = document.createElement("canvas");
+  if (!scene) return false;
   small.width = small.height = 16;
   const pen = small.getContext("2d");
   pen.drawImage(scene, 0, 0, 16, 16);
