@@ -4,12 +4,14 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from rtctl.app import plan
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
@@ -23,6 +25,7 @@ from rtctl.arm.kinematics import chain_of, clearance_of, placements, points_at, 
 from rtctl.arm.memory import MEASURED_POSTURE, Memory
 from rtctl.arm.pipe import initial
 from rtctl.design.pairs import hulls_of
+from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.log import schema
 from rtctl.log.read.run import read_run
@@ -400,6 +403,26 @@ def test_an_arm_that_moves_but_will_be_held_is_planned_for_though_the_first_look
     assert found["min_clearance_m"]["all"] >= robot().avoid.rho_min
     planned = [t for t, name, _ in found["statuses"] if name == "planned"]
     assert 0.7 < planned[0] < 1.0  # half a second after the goal
+
+
+def test_an_arm_for_whose_goal_no_posture_was_found_is_planned_for_again_before_anything_holds_it(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    planned, tries = plan.plan_joints, list[int]()
+
+    def at_second(*args: Any, **how: Any) -> np.ndarray:
+        tries.append(1)
+        if len(tries) == 1:
+            raise PlanError("plan: every posture found that has the goal touches something")
+        return planned(*args, **how)
+
+    monkeypatch.setattr(plan, "plan_joints", at_second)
+    monkeypatch.setattr(Guide, "_endings", lambda self, site, goal: [])
+    found = played(**across(STANDS["wall"][0]))
+    assert found["arrived"]
+    assert found["contacts"] == 0
+    said = {name: t for t, name, _ in reversed(found["statuses"])}
+    assert 0.3 < said["planned"] - said["no_plan"] < 1.1  # the law would be held a second later
 
 
 def test_a_way_is_left_to_what_will_cross_it_and_taken_again():

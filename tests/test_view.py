@@ -3,6 +3,7 @@
 import hashlib
 import http.client
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from rtctl.log.record import tap as taps
 from rtctl.log.record.draw import rotation
 from rtctl.log.record.recorder import blob_of
 from rtctl.log.record.requests import encode_event, encode_request
-from rtctl.log.record.ring import attach, create
+from rtctl.log.record.ring import PRODUCER, PRODUCER_START, attach, create, process_start
 from rtctl.log.record.scene import Scene
 from rtctl.log.record.surroundings import Thing
 from rtctl.log.record.tap import Tap
@@ -487,6 +488,21 @@ def test_a_live_source_follows_the_ring_and_says_when_it_ends(tmp_path: Path) ->
     assert "ball" in live.story.things
     ring.finish()
     assert live.step() == "The run has ended."
+
+
+def test_a_live_source_sees_that_who_ticked_was_killed(tmp_path: Path) -> None:
+    ring, row = ring_of(tmp_path)
+    with subprocess.Popen(["sleep", "600"]) as servo:
+        ring.words[PRODUCER], ring.words[PRODUCER_START] = servo.pid, process_start(servo.pid)
+        live = Live(ring=ring.path)
+        ring.put(1, row.tobytes(), 1)
+        assert live.step() == ""
+        assert live.step() == ""  # it lives, though no tick came
+        ring.put(1, row.tobytes(), 2)
+        servo.kill()
+        servo.wait()
+        live.step()  # its last words
+        assert live.step() == "The run has ended."
 
 
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())
