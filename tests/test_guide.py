@@ -15,7 +15,7 @@ from rtctl.app import plan
 from rtctl.app.adviser import Adviser
 from rtctl.app.arm_link import first_feedback
 from rtctl.app.guide import Guide, Seen
-from rtctl.app.postures import SLOTS, STEP, endings, inertia_of, links_keep, previewed, site_of, skin_of
+from rtctl.app.postures import SLOTS, STEP, endings, inertia_of, links_keep, previewed, quartered, site_of, skin_of
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
@@ -219,6 +219,19 @@ def test_links_keep_a_clearance_where_their_hulls_do_to_a_millimetre():
         assert keeps or true < 0.008 + 1e-3
         tried, kept = tried + 1, kept + keeps
     assert 5 < kept < 30
+
+
+def test_a_triangle_is_divided_without_a_hole_or_an_overlap():
+    """Each of many points of triangles lies in one of the pieces, by its barycentric coordinates there."""
+    rng = np.random.default_rng(6)
+    whole = rng.normal(size=(20, 3, 3))
+    pieces = quartered(whole)
+    for share in rng.dirichlet(np.ones(3), 50):
+        inside = []
+        for k, corners in enumerate(whole):
+            shares = [np.linalg.lstsq(piece.T, corners.T @ share)[0] for piece in pieces[4 * k : 4 * k + 4]]
+            inside.append(sum(bool((each > 0.0).all()) for each in shares))
+        assert inside == [1] * len(whole)
 
 
 def test_what_is_far_is_left_out_of_a_look_and_nothing_else():

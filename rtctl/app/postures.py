@@ -154,11 +154,11 @@ def links_keep(site: Site, q: F64) -> bool:
         link, corners, middle, radius = link[near], corners[near], middle[near], radius[near]
         if (_distances(site, q, Points(link, middle, np.minimum(radius, FINE), ())) < keep).any():
             return False
-        link, corners = np.repeat(link, 4), _quartered(corners)
+        link, corners = np.repeat(link, 4), quartered(corners)
     return True
 
 
-def _quartered(corners: F64) -> F64:
+def quartered(corners: F64) -> F64:
     """Return the triangles (4 t, 3, 3) that triangles (t, 3, 3) consist of, divided at the middles of their edges."""
     between = 0.5 * (corners + np.roll(corners, -1, axis=1))
     a, b, c = (np.stack([corners[:, k], between[:, k], between[:, k - 1]], axis=1) for k in range(3))

@@ -103,7 +103,7 @@ def _doing(session: Session) -> str:
     """Return what a daemon that starts is doing, '' for one that is ready."""
     try:
         status = session.ask({"verb": "status"})
-    except LinkError as error:  # between its lobby and its loop
+    except LinkError as error:  # between its lobby and its loop nobody reads: it may answer too late
         if not answers(session.path):
             raise
         return str(error)
