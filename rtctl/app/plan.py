@@ -38,8 +38,8 @@ HARDER = 6  # times as many starts for the goal's postures, where they are hard 
 STRAIGHT = 3  # ends of straight paths that are made quicker
 OTHERS, SIDE = 6, 3000  # more paths looked for, and postures looked at for all of these
 HOPE = 0.9  # of the time of the straight way to an end, that a path to it may take
-ROUGH, DRAWS = 80, 800  # attempts to make a path quicker: of each, and of the best
-SHORTCUTS = 10  # postures looked at for each of these, at most
+ROUGH, DRAWS = 300, 2400  # attempts to make a path quicker: of each, and of the best
+SHORTCUTS = 30  # postures looked at for each of these, at most
 AROUND = (0.5, 1.0, 2.0)  # [rad] around start and ends that samples are drawn from, in turn: joints that may turn
 # twice have a hundred times more room elsewhere
 REACH = 1.0  # [rad] towards a sample
