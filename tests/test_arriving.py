@@ -70,7 +70,7 @@ CASES = {
     "planned around a box that comes": Case(
         {"position_m": (-0.245, 0.473, 0.345)},
         MOVERS,
-        7.5,
+        5.5,
         (-1.653732, 1.31829, 0.879154, -0.521153, -1.921463, 3.605905, 0.264111),
         planner=True,
     ),
