@@ -25,6 +25,8 @@ SEEDS = 48  # random starts
 ENDS = 8  # postures returned at most
 ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
+REACHED, REACHED_ROT = 1e-4, 1e-3  # [m], [rad] within which a posture has a goal
+SLACK = 0.1  # of the goal's tolerances, where joints are on their limits: the same
 HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 FINE = 5e-4  # [m] the same where pieces of their surface are divided
@@ -85,14 +87,16 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
     """Return postures that have the goal and touch nothing, the best first; none where none is found.
 
     zone: share of the zones of joint limits that they keep free of, and more than their clearance, if the start does;
-    0: none but HAIR of that, for a goal that is nowhere else to be had.
+    0: none but HAIR of that, and the goal but for SLACK of its tolerances, for one that is nowhere else to be had.
     """
     robot = site.robot
     margin = np.maximum(zone * robot.limit.rho0, 1.5 * robot.limit.rho_min) if zone else HAIR * robot.limit.rho_min
     low, high = np.minimum(robot.q_min + margin, site.start), np.maximum(robot.q_max - margin, site.start)
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[site.start, robot.q_rest, robot.home], rng.uniform(low, high, (seeds, robot.n))])
-    found, has = postures_of(site.chain, starts, target_of(goal), low, high)
+    share = 0.0 if zone else SLACK
+    far, turned = max(REACHED, share * goal.tolerance), max(REACHED_ROT, share * goal.tolerance_rot)
+    found, has = postures_of(site.chain, starts, target_of(goal), low, high, far, turned)
     found = _unwound(site, found[has], low, high)
     rho = clearance_of(site.chain, robot.points, found, site.obstacles, 1.1 * robot.avoid.rho0)  # farther is as good
     out: list[Ending] = []

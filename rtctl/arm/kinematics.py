@@ -18,7 +18,6 @@ from rtctl.types import B1, F64, I64, Goal
 from rtctl.world.primitives import Obstacles, advanced_pose, distances_into
 from rtctl.world.rooms import count_rooms, farthest
 
-REACHED = 1e-4  # [m], and ten times that [rad], of a posture that has a goal
 STEPS = 80  # of the inverse kinematics
 LARGEST = 0.4  # [rad] of a joint in one of them
 
@@ -229,8 +228,10 @@ def _damped_step(J: F64, e: F64, free: B1, damping: float) -> F64:
 
 
 @kernel
-def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tuple[F64, bool]:
+def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64, far: float, turned: float) -> tuple[F64, bool]:
     """Return a posture (n,) near q0 that has the goal within low and high (n,), and whether it has.
+
+    far: [m], and turned [rad], from the goal, at which it is had.
 
     Damped least squares (Wampler 1986); a joint that a step takes against its bound is left out of it.
     """
@@ -240,8 +241,8 @@ def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tupl
         placements(chain, q, R, t)
         x, turn, J = tip_at(chain, R, t)
         e, e_rot = task_error(goal.task, goal.axis, goal.position, goal.wxyz, x, turn)
-        far, turned = np.sqrt((e * e).sum()), np.sqrt((e_rot * e_rot).sum())
-        if far < REACHED and turned < 10.0 * REACHED:
+        away, twist = np.sqrt((e * e).sum()), np.sqrt((e_rot * e_rot).sum())
+        if away < far and twist < turned:
             return q, True
         S = selection(goal.task, goal.axis, turn)
         k = S.shape[0]
@@ -255,7 +256,7 @@ def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tupl
         free = np.ones(n, np.bool_)
         step = np.zeros(n)
         for _again in range(3):
-            step = _damped_step(Js, es, free, 1e-5 + 1e-2 * (far * far + turned * turned))
+            step = _damped_step(Js, es, free, 1e-5 + 1e-2 * (away * away + twist * twist))
             bound = False
             for i in range(n):
                 if free[i] and ((q[i] >= high[i] and step[i] > 0.0) or (q[i] <= low[i] and step[i] < 0.0)):
@@ -271,11 +272,13 @@ def posture_of(chain: Chain, q0: F64, goal: Target, low: F64, high: F64) -> tupl
 
 
 @kernel
-def postures_of(chain: Chain, seeds: F64, goal: Target, low: F64, high: F64) -> tuple[F64, B1]:
+def postures_of(
+    chain: Chain, seeds: F64, goal: Target, low: F64, high: F64, far: float, turned: float
+) -> tuple[F64, B1]:
     """Return `posture_of` every seed (s, n): the postures (s, n) and which have the goal (s,)."""
     out, has = np.empty_like(seeds), np.empty(seeds.shape[0], np.bool_)
     for s in range(seeds.shape[0]):
-        out[s], has[s] = posture_of(chain, seeds[s], goal, low, high)
+        out[s], has[s] = posture_of(chain, seeds[s], goal, low, high, far, turned)
     return out, has
 
 
