@@ -112,6 +112,32 @@ def test_postures_of_a_goal_have_it_within_limits_and_clear():
         assert end.rho > 0.0
 
 
+def test_a_goal_that_touches_by_a_hair_has_a_posture_within_its_tolerance():
+    """The points of the hand reach a millimetre into a block at the goal itself: a higher tip has the goal as well."""
+    arm = robot()
+    model, data = arm.body.model, arm.body.model.createData()
+    frame = model.getFrameId("panda_hand_tcp")
+    at = np.array([0.5, 0.1, 0.3])
+    exact = endings(site_of(arm, around(), np.array(HOME)), Goal(at, np.array(DOWN), Task.POSE, 0.005, 0.02), 0)[0].q
+    hand = arm.points.link == arm.n  # the same place in all postures
+    deepest = float((arm.body.placed(exact, arm.points)[:, 2] - arm.points.radius)[hand].min())
+    top, size = deepest + 0.001, np.array([0.2, 0.2, 0.1, 0.0])
+    block = Shape("block", "box", size, np.array([at[0], at[1], top - 0.1]), UNIT, np.zeros(3), np.zeros(3))
+    site = site_of(arm, around(block), np.array(HOME))
+    for tolerance, are in ((0.001, False), (0.005, True)):
+        goal = Goal(at, np.array(DOWN), Task.POSE, tolerance, 0.02)
+        assert not endings(site, goal, 0)
+        found = endings(site, goal, 0, 0.0)
+        assert bool(found) == are
+        for end in found:
+            pin.forwardKinematics(model, data, end.q)
+            tip = pin.updateFramePlacement(model, data, frame)
+            assert np.linalg.norm(tip.translation - at) < 0.5 * tolerance
+            assert 2.0 * np.arccos(min(1.0, abs(quat_of(np.array(tip.rotation)) @ np.array(DOWN)))) < 0.5 * 0.02
+            lowest = (arm.body.placed(end.q, arm.points)[:, 2] - arm.points.radius)[hand].min()
+            assert lowest > top
+
+
 def test_the_whole_potential_has_its_minimum_at_the_goal():
     """At the goal no push, however near what rests is; beside it less than what draws the point there."""
     arm, q = robot(), np.array(HOME)

@@ -16,6 +16,7 @@ from rtctl.arm.outlook import Around, Pace, rollout
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
 from rtctl.design.solids import solids_of, surface
+from rtctl.kernel.rotations import R_of, exp3, quat_of
 from rtctl.plain import Json
 from rtctl.types import B1, F64, I64, Goal
 from rtctl.world.primitives import Obstacles, advance, distances_into
@@ -26,7 +27,9 @@ ENDS = 8  # postures returned at most
 ALIKE = 0.1  # [rad] within which two are one
 TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but free is better
 REACHED, REACHED_ROT = 1e-4, 1e-3  # [m], [rad] within which a posture has a goal
-SLACK = 0.1  # of the goal's tolerances, where joints are on their limits: the same
+SLACK = 0.1  # of the goal's tolerances, the same for one that is nowhere else to be had
+ASIDE = 0.4  # of these, by which that is looked for beside the goal
+DIRECTIONS, OTHERS = 12, 3  # in which it is, and times as many starts for all of them
 HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 FINE = 5e-4  # [m] the same where pieces of their surface are divided
@@ -87,16 +90,38 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
     """Return postures that have the goal and touch nothing, the best first; none where none is found.
 
     zone: share of the zones of joint limits that they keep free of, and more than their clearance, if the start does;
-    0: none but HAIR of that, and the goal but for SLACK of its tolerances, for one that is nowhere else to be had.
+    0: none but HAIR of that, and the goal but for a share of its tolerances, for one that is nowhere else to be had.
     """
+    if zone:
+        return _endings(site, (goal,), seed, zone, seeds, 0.0)
+    return _endings(site, (goal,), seed, zone, seeds, SLACK) or _endings(
+        site, _beside(goal, seed), seed, zone, OTHERS * seeds, SLACK
+    )
+
+
+def _beside(goal: Goal, seed: int) -> tuple[Goal, ...]:
+    """Return goals ASIDE of its tolerances beside a goal, in all directions."""
+    out, R = [], R_of(goal.wxyz)
+    for way in np.random.default_rng(seed).standard_normal((DIRECTIONS, 2, 3)):
+        aside, turn = ASIDE * way / np.linalg.norm(way, axis=1)[:, None]
+        there, turned = goal.position + goal.tolerance * aside, exp3(goal.tolerance_rot * turn) @ R
+        out.append(goal._replace(position=there, wxyz=quat_of(turned)))
+    return tuple(out)
+
+
+def _endings(site: Site, goals: Sequence[Goal], seed: int, zone: float, seeds: int, slack: float) -> list[Ending]:
+    """Return `endings` that have one of these goals within a share of its tolerances."""
     robot = site.robot
     margin = np.maximum(zone * robot.limit.rho0, 1.5 * robot.limit.rho_min) if zone else HAIR * robot.limit.rho_min
     low, high = np.minimum(robot.q_min + margin, site.start), np.maximum(robot.q_max - margin, site.start)
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[site.start, robot.q_rest, robot.home], rng.uniform(low, high, (seeds, robot.n))])
-    share = 0.0 if zone else SLACK
-    far, turned = max(REACHED, share * goal.tolerance), max(REACHED_ROT, share * goal.tolerance_rot)
-    found, has = postures_of(site.chain, starts, target_of(goal), low, high, far, turned)
+    far, turned = max(REACHED, slack * goals[0].tolerance), max(REACHED_ROT, slack * goals[0].tolerance_rot)
+    some = [
+        postures_of(site.chain, starts[k :: len(goals)], target_of(goal), low, high, far, turned)
+        for k, goal in enumerate(goals)
+    ]
+    found, has = (np.concatenate(each) for each in zip(*some, strict=True))
     found = _unwound(site, found[has], low, high)
     rho = clearance_of(site.chain, robot.points, found, site.obstacles, 1.1 * robot.avoid.rho0)  # farther is as good
     out: list[Ending] = []
