@@ -33,7 +33,7 @@ from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.search import lasts
-from rtctl.arm.task import error_of
+from rtctl.arm.task import error_of, selection
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Advice, Goal, Shape, State, Status
@@ -61,6 +61,8 @@ AGAIN = 0.4  # [s] between two attempts, longer by this after each where there w
 WATCH = 0.5  # [s] between two looks whether an arm that moves gets there in time
 LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, after which the law is late
 DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
+ALIKE = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
+SPARE = 3  # joints that a goal leaves free, with which the tip's own way is kept to one that is as free
 PLANS = 8  # for one goal in a world that stands still
 
 
@@ -190,7 +192,7 @@ class Guide:
         self.ends = self._endings(site, goal)
         for end in self.ends:
             Q, there = previewed(site, goal, end.q, A)
-            if there and np.abs(Q[-1] - end.q).max() < 0.3 and self._clear(site, Q):
+            if there and self._clear(site, Q) and self._ends_well(site, goal, Q[-1], end):
                 self._expect(m, STEP * len(Q))
                 return self._given(end)
         straight = next((way for end in self.ends if (way := self._straight(site, end)) is not None), None)
@@ -202,6 +204,13 @@ class Guide:
         self.given = self.ends[0]
         planned = self._sooner(m, goal, site, Q) if there else self._planned(m, goal, site) if self.plans else None
         return planned or self._given(self.ends[0])
+
+    def _ends_well(self, site: Site, goal: Goal, q: F64, end: Ending) -> bool:
+        """Return whether the law may end at q (n,) when it is given a posture: near it, or as free elsewhere."""
+        if np.abs(q - end.q).max() < ALIKE:
+            return True
+        spare = self.robot.n - len(selection(int(goal.task), goal.axis, np.eye(3)))
+        return spare >= SPARE and free_of_all(site, q)
 
     # -- what the law would not do in time ---------------------------------------------------------------------------
 
