@@ -1,7 +1,8 @@
 """Goals that an arm reaches beside what is near them, by pybullet: arrived, in time, never below the clearance."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 from rtctl.app.sim import simulate_scenario
@@ -163,3 +164,31 @@ def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance
     assert found["contacts"] == 0
     assert found["min_clearance_m"]["all"] is None or found["min_clearance_m"]["all"] >= CLEARANCE
     assert found["arrived"], found["goals"]
+
+
+@pytest.mark.parametrize(
+    ("start", "goal"),
+    [
+        ((-0.4242, 0.5096, 1.4534, -0.5557, -0.6333, 2.5023, -0.8068), (-0.5127, -0.5197, 0.3478)),
+        ((1.9893, -0.7283, 0.5683, -0.6004, -2.0297, 2.9544, -0.5295), (-0.3568, 0.3469, 0.9695)),
+    ],
+)
+def test_an_arm_that_has_its_goal_keeps_it(start: tuple[float, ...], goal: tuple[float, ...]):
+    """Joints that drift on to their posture came to a limit, which took the tip off its goal for two seconds."""
+    told: Json = {
+        "robot": "panda",
+        "start_q_rad": start,
+        "goal": ({"at_s": 0.2, "position_m": goal},),
+        "duration_s": 7.0,
+    }
+    away: list[float] = []  # [m] by the plant
+
+    def watch(servo: Any, truth: Any, turn: Any) -> None:
+        away.append(float(np.linalg.norm(truth.tip - goal)))
+
+    config, source = ROOT / "configs" / "panda.toml", ROOT / "configs" / "none.toml"
+    found = simulate_scenario(convert(told, Scenario, "keeps"), config, source, watch=watch)
+    time = found["goals"][0]["time_to_goal_s"]
+    assert found["arrived"]
+    assert time < 4.5
+    assert max(away[round(1e3 * (0.2 + time)) + 1 :]) < 5e-3

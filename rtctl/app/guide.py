@@ -63,6 +63,7 @@ LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, 
 DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
 ALIKE = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
 SPARE = 3  # joints that a goal leaves free, with which the tip's own way is kept to one that is as free
+DRIFTED = 0.15  # of what is tolerated, by which an arm that was at its goal is away from it again
 PLANS = 8  # for one goal in a world that stands still
 
 
@@ -110,6 +111,7 @@ class Guide:
     waits_since: int  # tick; -1: it does not wait
     look: int  # tick of the next look at what comes
     again: int  # tick of the next attempt
+    nearest: float  # the tip was to the goal since it had it, of what is tolerated
     late: int  # tick by which the arm should be there; -1: nothing is known of that
     watch: int  # tick of the next look whether it will
     tries: int
@@ -140,7 +142,7 @@ class Guide:
             if m.goal is None:
                 self._forget()
             self.way = None
-            return None
+            return self._there(m, m.goal) if m.goal is not None and m.state == State.RUN else None
         if m.goal.streams:  # the next one comes before anything is found, or the arm stops
             self._forget()
             self.fresh, self.taught = False, True
@@ -157,6 +159,10 @@ class Guide:
             self.look = m.tick + round(LOOK / self.robot.dt)
         if self.way is not None:
             return self._along(m, m.goal, self.way, changed)
+        if m.status == Status.MOVING and self.nearest < 1.0:
+            stays = self._there(m, m.goal)
+            if stays is not None:
+                return stays
         if changed and not self.taught:
             return self._reviewed(m, m.goal)
         if m.status in HELD and m.tick >= self.again:
@@ -211,6 +217,26 @@ class Guide:
             return True
         spare = self.robot.n - len(selection(int(goal.task), goal.axis, np.eye(3)))
         return spare >= SPARE and free_of_all(site, q)
+
+    # -- at the goal ---------------------------------------------------------------------------------------------------
+
+    def _there(self, m: Seen, goal: Goal) -> Advice | None:
+        """Return the posture of now where joints that drift on to another one take the tip off its goal again."""
+        if goal.streams or self.fresh or self.taught or not (self.robot.postures and self.due(m.tick)):
+            return None
+        site, to = self._site(m), self.robot.q_rest if goal.posture is None else goal.posture
+        away = self._away(site, goal)
+        self.nearest = min(self.nearest, away)
+        if away < self.nearest + DRIFTED or moves(site) or np.abs(m.q - to).max() < NEAR:
+            return None
+        self.nearest, rho = away, self._room(site, m.q)
+        return self._given(Ending(m.q, rho, bool(links_clear(site, m.q[None], np.array([rho]))[0]), 0.0))
+
+    def _away(self, site: Site, goal: Goal) -> float:
+        """Return how far the tip is from its goal, of what is tolerated."""
+        tip = self.robot.body.evaluate(site.start, np.zeros(self.robot.n), self.robot.points)
+        far, turned = error_of(goal, tip.x, tip.R)
+        return max(far / goal.tolerance, turned / goal.tolerance_rot)
 
     # -- what the law would not do in time ---------------------------------------------------------------------------
 
@@ -391,7 +417,7 @@ class Guide:
     def _forget(self) -> None:
         self.way, self.given, self.ends = None, None, []
         self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
-        self.late, self.watch = -1, 0
+        self.late, self.watch, self.nearest = -1, 0, np.inf
         self.blocked, self.told, self.scene = False, "", b""
 
 
