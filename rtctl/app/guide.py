@@ -3,8 +3,9 @@
 Of a new goal it looks where the tip's own way would end. Where that is short of the goal, or in a limit or a shadow, it
 finds a posture that has the goal (`postures`): the null space heads for it, or the joints do, when the tip's way does
 not lead there. Where the arm is held all the same it plans a way (`plan`) and leads the joints along it; it yields to
-what moves, plans anew on a blocked way, and tries again when something moved. Counts bound its work, so that in a
-simulation equal inputs give equal advice.
+what moves, plans anew on a blocked way, and tries again when something moved. At the goal the arm keeps the posture
+that it has, where drifting on would take the tip off again. Counts bound its work, so that in a simulation equal inputs
+give equal advice.
 """
 
 from typing import NamedTuple
@@ -224,19 +225,22 @@ class Guide:
         """Return the posture of now where joints that drift on to another one take the tip off its goal again."""
         if goal.streams or self.fresh or self.taught or not (self.robot.postures and self.due(m.tick)):
             return None
-        site, to = self._site(m), self.robot.q_rest if goal.posture is None else goal.posture
-        away = self._away(site, goal)
+        to = self.robot.q_rest if goal.posture is None else goal.posture
+        if np.abs(m.q - to).max() < NEAR:
+            return None
+        site = self._site(m)
+        far, turned = self._missed(site, goal)
+        away = max(far / goal.tolerance, turned / goal.tolerance_rot)
         self.nearest = min(self.nearest, away)
-        if away < self.nearest + DRIFTED or moves(site) or np.abs(m.q - to).max() < NEAR:
+        if away < self.nearest + DRIFTED or moves(site):
             return None
         self.nearest, rho = away, self._room(site, m.q)
         return self._given(Ending(m.q, rho, bool(links_clear(site, m.q[None], np.array([rho]))[0]), 0.0))
 
-    def _away(self, site: Site, goal: Goal) -> float:
-        """Return how far the tip is from its goal, of what is tolerated."""
+    def _missed(self, site: Site, goal: Goal) -> tuple[float, float]:
+        """Return how far [m], and by what angle [rad], the tip is from the goal where the arm starts."""
         tip = self.robot.body.evaluate(site.start, np.zeros(self.robot.n), self.robot.points)
-        far, turned = error_of(goal, tip.x, tip.R)
-        return max(far / goal.tolerance, turned / goal.tolerance_rot)
+        return error_of(goal, tip.x, tip.R)
 
     # -- what the law would not do in time ---------------------------------------------------------------------------
 
@@ -262,8 +266,7 @@ class Guide:
 
     def _tip_takes(self, site: Site, goal: Goal) -> float:
         """Return the time [s] of the tip straight to the goal."""
-        tip = self.robot.body.evaluate(site.start, np.zeros(self.robot.n), self.robot.points)
-        far, turned = error_of(goal, tip.x, tip.R)
+        far, turned = self._missed(site, goal)
         return max(far / self.robot.motion.v_max, turned / self.robot.motion.w_max)
 
     def _overdue(self, m: Seen, goal: Goal) -> Advice | None:
