@@ -166,6 +166,7 @@ def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance
     assert found["arrived"], found["goals"]
 
 
+@pytest.mark.parametrize("plant", [{}, {"payload_kg": 0.5, "coulomb_Nm": 0.3}], ids=["as told", "not as told"])
 @pytest.mark.parametrize(
     ("start", "goal"),
     [
@@ -173,13 +174,14 @@ def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance
         ((1.9893, -0.7283, 0.5683, -0.6004, -2.0297, 2.9544, -0.5295), (-0.3568, 0.3469, 0.9695)),
     ],
 )
-def test_an_arm_that_has_its_goal_keeps_it(start: tuple[float, ...], goal: tuple[float, ...]):
+def test_an_arm_that_has_its_goal_keeps_it(start: tuple[float, ...], goal: tuple[float, ...], plant: Json):
     """Joints that drift on to their posture came to a limit, which took the tip off its goal for two seconds."""
     told: Json = {
         "robot": "panda",
         "start_q_rad": start,
         "goal": ({"at_s": 0.2, "position_m": goal},),
         "duration_s": 7.0,
+        "plant": plant,
     }
     away: list[float] = []  # [m] by the plant
 
