@@ -62,7 +62,7 @@ AGAIN = 0.4  # [s] between two attempts, longer by this after each where there w
 WATCH = 0.5  # [s] between two looks whether an arm that moves gets there in time
 LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, after which the law is late
 DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
-ALIKE = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
+AS_GIVEN = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
 SPARE = 3  # joints that a goal leaves free, with which the tip's own way is kept to one that is as free
 DRIFTED = 0.15  # of what is tolerated, by which an arm that was at its goal is away from it again
 PLANS = 8  # for one goal in a world that stands still
@@ -214,7 +214,7 @@ class Guide:
 
     def _ends_well(self, site: Site, goal: Goal, q: F64, end: Ending) -> bool:
         """Return whether the law may end at q (n,) when it is given a posture: near it, or as free elsewhere."""
-        if np.abs(q - end.q).max() < ALIKE:
+        if np.abs(q - end.q).max() < AS_GIVEN:
             return True
         spare = self.robot.n - len(selection(int(goal.task), goal.axis, np.eye(3)))
         return spare >= SPARE and free_of_all(site, q)

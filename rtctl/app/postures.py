@@ -29,7 +29,7 @@ TIGHT = 1.5  # [s] that a posture without any room is worth: one as far away but
 REACHED, REACHED_ROT = 1e-4, 1e-3  # [m], [rad] within which a posture has a goal
 SLACK = 0.1  # of the goal's tolerances, the same for one that is nowhere else to be had
 ASIDE = 0.4  # of these, by which that is looked for beside the goal
-DIRECTIONS, OTHERS = 12, 3  # in which it is, and times as many starts for all of them
+DIRECTIONS, MORE_SEEDS = 12, 3  # in which it is, and times as many starts for all of them
 HAIR = 0.05  # of the clearance from joint limits, that no posture is without
 SKIN = 0.005  # [m] by which a clearance of the links may be understated
 FINE = 5e-4  # [m] the same where pieces of their surface are divided
@@ -95,7 +95,7 @@ def endings(site: Site, goal: Goal, seed: int, zone: float = 1.0, seeds: int = S
     if zone:
         return _endings(site, (goal,), seed, zone, seeds, 0.0)
     return _endings(site, (goal,), seed, zone, seeds, SLACK) or _endings(
-        site, _beside(goal, seed), seed, zone, OTHERS * seeds, SLACK
+        site, _beside(goal, seed), seed, zone, MORE_SEEDS * seeds, SLACK
     )
 
 
