@@ -60,10 +60,12 @@ SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where wha
 PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
 AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
 WATCH = 0.5  # [s] between two looks whether an arm that moves gets there in time
+CREEPS = 0.1  # of its full speed and of its way, that an arm goes between these looks, or it is held
 LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, after which the law is late
 DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
 AS_GIVEN = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
 SPARE = 3  # joints that a goal leaves free, with which the tip's own way is kept to one that is as free
+SOON = 0.15  # [s] ahead of what pushes, in which joints at the goal are held back
 DRIFTED = 0.15  # of what is tolerated, by which an arm that was at its goal is away from it again
 PLANS = 8  # for one goal in a world that stands still
 
@@ -112,9 +114,11 @@ class Guide:
     waits_since: int  # tick; -1: it does not wait
     look: int  # tick of the next look at what comes
     again: int  # tick of the next attempt
+    kept: F64 | None  # (n,) [rad] at the goal, at the last look, where nothing pushed
     nearest: float  # the tip was to the goal since it had it, of what is tolerated
     late: int  # tick by which the arm should be there; -1: nothing is known of that
     watch: int  # tick of the next look whether it will
+    left: float  # [s] the tip would have taken to the goal, straight, at the last such look
     tries: int
     blocked: bool  # something comes across the way
     told: str  # why there was no way
@@ -222,20 +226,29 @@ class Guide:
     # -- at the goal ---------------------------------------------------------------------------------------------------
 
     def _there(self, m: Seen, goal: Goal) -> Advice | None:
-        """Return the posture of now where joints that drift on to another one take the tip off its goal again."""
+        """Return the posture of a moment ago where joints that drift on to another one come to what pushes them.
+
+        Or of now, where that has taken the tip off its goal already.
+        """
         if goal.streams or self.fresh or self.taught or not (self.robot.postures and self.due(m.tick)):
             return None
+        was, self.kept = self.kept, None
         to = self.robot.q_rest if goal.posture is None else goal.posture
         if np.abs(m.q - to).max() < NEAR:
             return None
         site = self._site(m)
+        if moves(site):
+            return None
         far, turned = self._missed(site, goal)
         away = max(far / goal.tolerance, turned / goal.tolerance_rot)
         self.nearest = min(self.nearest, away)
-        if away < self.nearest + DRIFTED or moves(site):
+        if free_of_all(site, m.q if was is None else m.q + SOON / PERIOD * (m.q - was)):
+            was, self.kept = None, m.q
+        if (was is None and away < self.nearest + DRIFTED) or m.tick < self.again:
             return None
-        self.nearest, rho = away, self._room(site, m.q)
-        return self._given(Ending(m.q, rho, bool(links_clear(site, m.q[None], np.array([rho]))[0]), 0.0))
+        keep, self.nearest, self.again = m.q if was is None else was, away, m.tick + round(AGAIN / self.robot.dt)
+        rho = self._room(site, keep)
+        return self._given(Ending(keep, rho, bool(links_clear(site, keep[None], np.array([rho]))[0]), 0.0))
 
     def _missed(self, site: Site, goal: Goal) -> tuple[float, float]:
         """Return how far [m], and by what angle [rad], the tip is from the goal where the arm starts."""
@@ -273,6 +286,10 @@ class Guide:
         """Plan for an arm that moves, where it will be held or late."""
         site = self._site(m)
         self.watch = m.tick + round(WATCH / self.robot.dt)
+        left, was = self._tip_takes(site, goal), self.left
+        self.left = left
+        if not moves(site) and left > was - min(CREEPS * was, CREEPS * WATCH):
+            return self._planned(m, goal, site)
         takes = self._law_takes(site, goal)
         if takes < LATEST or m.tick + takes / self.robot.dt < self.late:
             return None
@@ -284,7 +301,7 @@ class Guide:
         """Take note of when an arm should be there that takes so long [s]."""
         if self.plans:
             self.late = m.tick + round(_late(takes) / self.robot.dt)
-            self.watch = m.tick + round(WATCH / self.robot.dt)
+            self.watch, self.left = m.tick + round(WATCH / self.robot.dt), np.inf
 
     def _law_takes(self, site: Site, goal: Goal) -> float:
         """Return the time [s] in which the law gets there past what rests, infinite where that holds it."""
@@ -420,7 +437,7 @@ class Guide:
     def _forget(self) -> None:
         self.way, self.given, self.ends = None, None, []
         self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
-        self.late, self.watch, self.nearest = -1, 0, np.inf
+        self.late, self.watch, self.left, self.nearest, self.kept = -1, 0, np.inf, np.inf, None
         self.blocked, self.told, self.scene = False, "", b""
 
 
