@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.app.postures import Ending, Site, along, links_clear
-from rtctl.arm.kinematics import clearance_of, clearances, travels
+from rtctl.arm.kinematics import clearance_of, clearances, each_clearance, travels
 from rtctl.types import B1, F64, Advice
 
 FINE = 0.03  # [rad] between two postures of a way
 AHEAD, POINTS_AHEAD = 0.22, 0.35  # [s] of full speed of joints, and of points, that the posture to head for is ahead
 NEXT = 40  # postures ahead among which progress is looked for, and back, to which it backs off
-SURE = 0.6  # of the way's own clearance that the straight line to it keeps
+SURE = 0.6  # of the way's own clearance that the straight line to it keeps, and of a point's there, before it
+STAYS = 0.98  # of a point's clearance, below which it is nearer than it was
 HORIZON = 1.2  # [s] of what moves that is looked at
 LATE = 1.3  # by which the arm may take longer than at full speed
 FLOOR = 1.5  # of the clearance, below which something is in the way
@@ -23,7 +24,8 @@ class Way(NamedTuple):
     """A way of postures."""
 
     Q: F64  # (k, n) [rad] FINE apart
-    rho: F64  # (k,) [m] of the points in each
+    each: F64  # (k, m) [m] of each point, in each of them
+    rho: F64  # (k,) [m] the least of these
     clear: B1  # (k,) the links keep the clearance
 
     @property
@@ -35,8 +37,9 @@ class Way(NamedTuple):
 def way_of(site: Site, path: F64) -> Way:
     """Return the way along a path (k, n) [rad]."""
     Q = np.concatenate([path[:1], *(along(a, b, FINE) for a, b in pairwise(path))])
-    rho = clearance_of(site.chain, site.robot.points, Q, site.obstacles)
-    return Way(Q, rho, links_clear(site, Q, rho))
+    each = each_clearance(site.chain, site.robot.points, Q, site.obstacles)
+    rho = each.min(axis=1)
+    return Way(Q, each, rho, links_clear(site, Q, rho))
 
 
 def progress(way: Way, at: int, q: F64) -> int:
@@ -47,13 +50,18 @@ def progress(way: Way, at: int, q: F64) -> int:
 def heading(site: Site, way: Way, at: int, checked: bool) -> Advice:
     """Return the posture to head for from the start; checked: no farther than the straight line to it is free.
 
-    Of joints and of points: for the way there the field of what rests is that of the posture.
+    As far ahead as joints and points come in a moment, and no farther than past what is narrow: on the way there the
+    field of what rests reaches each point as far as that point is off in the posture.
     """
     robot, q, next_ones = site.robot, site.start, way.Q[at : at + NEXT]
     joints = (np.abs(next_ones - q) / _full_speed(site)).max(axis=1)
     points = travelled(site, next_ones) / robot.motion.v_max
     reach = np.flatnonzero((joints <= AHEAD) & (points <= POINTS_AHEAD))
     ahead = at + int(reach[-1]) if len(reach) else min(at + 1, len(way.Q) - 1)
+    each = np.minimum(way.each[at : ahead + 1], robot.avoid.rho0)
+    passed = np.minimum.accumulate(each, axis=0)  # from the start on
+    narrows = ((passed < SURE * each) & (passed < STAYS * each[0])).any(axis=1)
+    ahead = max(min(at + 1, ahead), at + int(np.flatnonzero(~narrows)[-1]))
     while checked and ahead > at + 1:
         rho = float(clearance_of(site.chain, robot.points, along(q, way.Q[ahead], 2.0 * FINE), site.obstacles).min())
         if rho >= SURE * float(way.rho[at : ahead + 1].min()):

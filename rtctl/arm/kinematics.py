@@ -282,6 +282,25 @@ def postures_of(
     return out, has
 
 
+@kernel
+def _each_clearance(chain: Chain, link: I64, local: F64, radius: F64, Q: F64, obstacles: Obstacles) -> F64:
+    slots, m = obstacles.active.shape[0], radius.shape[0]
+    out, rho = np.empty((Q.shape[0], m)), np.empty((slots, 4, m))
+    for b in range(Q.shape[0]):
+        distances_into(points_at(chain, link, local, Q[b]), radius, obstacles, np.inf, rho)
+        count_rooms(obstacles.room, rho)
+        for j in range(m):
+            out[b, j] = np.inf
+            for k in range(slots):
+                out[b, j] = min(out[b, j], rho[k, 0, j])
+    return out
+
+
+def each_clearance(chain: Chain, points: Points, Q: F64, obstacles: Obstacles) -> F64:
+    """Return the distance (b, m) [m] of each point to the obstacles of now, at postures Q (b, n); see `clearances`."""
+    return _each_clearance(chain, points.link, points.local, points.radius, Q, obstacles)
+
+
 def clearance_of(chain: Chain, points: Points, Q: F64, obstacles: Obstacles, cutoff: float = np.inf) -> F64:
     """Return `clearances` of postures (b, n) at the obstacles of now."""
     still = np.zeros(len(Q))
