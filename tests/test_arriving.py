@@ -151,6 +151,25 @@ CASES = {
         (0.422, 1.096, 1.15, -0.611),
         robot="planar4",
     ),
+    # its way is straight, but one link comes near the edge and goes from it again
+    "past the edge of a table": Case(
+        {"position_m": (0.561470, 0.892136, 0.0), "wxyz": (0.82155262467, 0.0, 0.0, 0.57013269060)},
+        (
+            {
+                "name": "table",
+                "type": "box",
+                "size_m": (0.8, 0.8, 0.04),
+                "position_m": (0.561470, 0.892136, -0.08),
+            },
+        ),
+        5.5,
+        (0.921585, 0.129722, -0.783967, 1.600328),
+        robot="planar4",
+    ),
+    # the tip's own way ends 30 mm short, at a joint's limit, and creeps there
+    "a limit that nothing foretold": Case(
+        {"position_m": (-0.107, -0.449, 1.043)}, (), 6.3, (1.298, 0.348, 0.352, -1.539, 0.126, 2.086, 2.457)
+    ),
 }
 
 
@@ -168,14 +187,18 @@ def test_the_goal_is_reached_in_time_and_nothing_comes_nearer_than_the_clearance
 
 @pytest.mark.parametrize("plant", [{}, {"payload_kg": 0.5, "coulomb_Nm": 0.3}], ids=["as told", "not as told"])
 @pytest.mark.parametrize(
-    ("start", "goal"),
+    ("start", "goal", "within"),
     [
-        ((-0.4242, 0.5096, 1.4534, -0.5557, -0.6333, 2.5023, -0.8068), (-0.5127, -0.5197, 0.3478)),
-        ((1.9893, -0.7283, 0.5683, -0.6004, -2.0297, 2.9544, -0.5295), (-0.3568, 0.3469, 0.9695)),
+        ((-0.4242, 0.5096, 1.4534, -0.5557, -0.6333, 2.5023, -0.8068), (-0.5127, -0.5197, 0.3478), 4.3),
+        ((1.9893, -0.7283, 0.5683, -0.6004, -2.0297, 2.9544, -0.5295), (-0.3568, 0.3469, 0.9695), 2.6),
+        ((-2.1206, 0.8704, 0.8497, -1.5942, 0.7861, 1.1349, -0.9995), (0.1524, 0.3395, 0.8084), 3.5),
+        ((-1.305, 0.562, 2.53, -0.656, 1.522, 1.353, 0.423), (-0.433, 0.433, 0.838), 2.8),
     ],
 )
-def test_an_arm_that_has_its_goal_keeps_it(start: tuple[float, ...], goal: tuple[float, ...], plant: Json):
-    """Joints that drift on to their posture came to a limit, which took the tip off its goal for two seconds."""
+def test_an_arm_that_has_its_goal_keeps_it(
+    start: tuple[float, ...], goal: tuple[float, ...], within: float, plant: Json
+):
+    """Joints that drift on to their posture came to a limit, which took the tip off its goal for up to 3.5 seconds."""
     told: Json = {
         "robot": "panda",
         "start_q_rad": start,
@@ -192,5 +215,5 @@ def test_an_arm_that_has_its_goal_keeps_it(start: tuple[float, ...], goal: tuple
     found = simulate_scenario(convert(told, Scenario, "keeps"), config, source, watch=watch)
     time = found["goals"][0]["time_to_goal_s"]
     assert found["arrived"]
-    assert time < 4.5
+    assert time < within  # it is there for good
     assert max(away[round(1e3 * (0.2 + time)) + 1 :]) < 5e-3
