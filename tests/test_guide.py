@@ -19,6 +19,7 @@ from rtctl.app.postures import SLOTS, STEP, endings, inertia_of, links_keep, pre
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate_scenario
 from rtctl.app.simulator import open_simulator
+from rtctl.app.times import dulled
 from rtctl.arm.field import APART, Ends, MovingPoints, field_buffers, field_to
 from rtctl.arm.freedom import Room, body_of, first_blocked
 from rtctl.arm.kinematics import chain_of, clearance_of, placements, points_at, tip_at
@@ -354,7 +355,7 @@ def test_whether_the_law_gets_past_what_stands_there_is_known_before_it_goes(nam
     assert arrived[-1] != holds
     goal = Goal(np.array(ACROSS), UNIT, Task.POSITION, 0.003, 0.015)
     site = site_of(run.robot, run.memory.world.obstacles, np.array(ASIDE))
-    Q, there = previewed(site, goal, run.robot.q_rest, Guide(run.robot, True)._dulled(site), run.robot.avoid.rho_min)
+    Q, there = previewed(site, goal, run.robot.q_rest, dulled(site), run.robot.avoid.rho_min)
     assert there != holds
     P = run.robot.body.placed(Q[-1], run.robot.points)
     assert distances(P, run.robot.points.radius, site.obstacles)[0].min() > 0.9 * run.robot.avoid.rho_min

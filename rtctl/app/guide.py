@@ -4,7 +4,7 @@ Of a new goal it looks where the tip's own way would end. Where that is short of
 finds a posture that has the goal (`postures`): the null space heads for it, or the joints do, when the tip's way does
 not lead there. Where the arm is held all the same it plans a way (`plan`) and leads the joints along it; it yields to
 what moves, plans anew on a blocked way, and tries again when something moved. At the goal the arm keeps the posture
-that it has, where drifting on would take the tip off again. Counts bound its work, so that in a simulation equal inputs
+that it has, before drifting on takes the tip off again. Counts bound its work, so that in a simulation equal inputs
 give equal advice.
 """
 
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.app import plan
+from rtctl.app.course import NEAR, Course
 from rtctl.app.postures import (
     STEP,
     Ending,
@@ -29,12 +30,12 @@ from rtctl.app.postures import (
     straight_room,
     swept,
 )
-from rtctl.app.way import Way, comes, heading, moves, progress, travelled, way_of, yielding
+from rtctl.app.times import LATEST, is_met, joints_take, late, law_takes, missed, tip_takes
+from rtctl.app.way import heading, moves, way_of
 from rtctl.arm.kinematics import chain_of, clearance_of
 from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
-from rtctl.arm.search import lasts
-from rtctl.arm.task import error_of, selection
+from rtctl.arm.task import selection
 from rtctl.errors import PlanError
 from rtctl.kernel.rotations import quat_of
 from rtctl.types import F64, Advice, Goal, Shape, State, Status
@@ -54,15 +55,10 @@ HELD = frozenset(
     )
 )
 ZONES = (1.0, 0.4, 0.0)  # of those of joint limits, that a posture keeps free of; tried in this order
-NEAR, NEARLY = 0.06, 0.015  # [rad], [m] of points, from the end of a way, where the goal itself is headed for
-STUCK = 0.8  # [s] without progress along a way
 SWEPT = ((0.4, 0.8, 1.2, 1.6, 2.0, 2.4), (0.4, 0.8), ())  # [s] ahead, where what moves may not be; tried in this order
-PATIENCE = 0.5  # [s] for which it waits for what moves, then another way is planned
 AGAIN = 0.4  # [s] between two attempts, longer by this after each where there was no way
 WATCH = 0.5  # [s] between two looks whether an arm that moves gets there in time
 CREEPS = 0.2  # of its full speed and of its way, that an arm goes between these looks, or it is held
-LATER, LATEST = 1.25, 0.75  # of the time that another way takes, and [s] more, after which the law is late
-DULL = 0.1  # of the largest inertia, that every joint has beside its own where it is pushed aside
 AS_GIVEN = 0.3  # [rad] of a joint, within which the law ends in the posture that it is given
 SPARE = 3  # joints that a goal leaves free, with which the tip's own way is kept to one that is as free
 SOON = 0.15  # [s] ahead of what pushes, in which joints at the goal are held back
@@ -106,12 +102,9 @@ def warm(robot: Robot) -> None:
 class Guide:
     """What is known beside the servo of one robot's goal."""
 
-    way: Way | None
+    course: Course | None  # of an arm that is led
     given: Ending | None  # the posture that was advised
     ends: list[Ending]
-    at: int  # which posture of the way it has come to
-    moved_at: int  # tick of the last progress along it
-    waits_since: int  # tick; -1: it does not wait
     look: int  # tick of the next look at what comes
     again: int  # tick of the next attempt
     kept: F64 | None  # (n,) [rad] at the goal, at the last look, where nothing pushed
@@ -120,7 +113,6 @@ class Guide:
     watch: int  # tick of the next look whether it will
     left: float  # [s] the tip would have taken to the goal, straight, at the last such look
     tries: int
-    blocked: bool  # something comes across the way
     told: str  # why there was no way
     scene: bytes  # what rests
 
@@ -146,7 +138,7 @@ class Guide:
         if m.state != State.RUN or m.goal is None or m.status == Status.ARRIVED:
             if m.goal is None:
                 self._forget()
-            self.way = None
+            self.course = None
             return self._there(m, m.goal) if m.goal is not None and m.state == State.RUN else None
         if m.goal.streams:  # the next one comes before anything is found, or the arm stops
             self._forget()
@@ -162,8 +154,8 @@ class Guide:
         if changed:
             self.scene, self.tries = self._scene(m), 0
             self.look = m.tick + round(LOOK / self.robot.dt)
-        if self.way is not None:
-            return self._along(m, m.goal, self.way, changed)
+        if self.course is not None:
+            return self._along(m, m.goal, self.course, changed)
         if m.status == Status.MOVING and self.nearest < 1.0:
             stays = self._there(m, m.goal)
             if stays is not None:
@@ -210,7 +202,7 @@ class Guide:
         if straight is not None:
             return self._led(m, goal, site, straight)
         if not self.ends:
-            self._expect(m, self._tip_takes(site, goal))  # other starts may find some, though nothing holds the arm yet
+            self._expect(m, tip_takes(site, goal))  # other starts may find some, though nothing holds the arm yet
             return self._planned(m, goal, site) if not there and self.plans else None
         self.given = self.ends[0]
         planned = self._sooner(m, goal, site, Q) if there else self._planned(m, goal, site) if self.plans else None
@@ -239,7 +231,7 @@ class Guide:
         site = self._site(m)
         if moves(site):
             return None
-        far, turned = self._missed(site, goal)
+        far, turned = missed(site, goal)
         away = max(far / goal.tolerance, turned / goal.tolerance_rot)
         self.nearest = min(self.nearest, away)
         if free_of_all(site, m.q if was is None else m.q + SOON / PERIOD * (m.q - was)):
@@ -250,47 +242,34 @@ class Guide:
         rho = self._room(site, keep)
         return self._given(Ending(keep, rho, bool(links_clear(site, keep[None], np.array([rho]))[0]), 0.0))
 
-    def _missed(self, site: Site, goal: Goal) -> tuple[float, float]:
-        """Return how far [m], and by what angle [rad], the tip is from the goal where the arm starts."""
-        tip = self.robot.body.evaluate(site.start, np.zeros(self.robot.n), self.robot.points)
-        return error_of(goal, tip.x, tip.R)
-
     # -- what the law would not do in time ---------------------------------------------------------------------------
 
     def _sooner(self, m: Seen, goal: Goal, site: Site, Q: F64) -> Advice | None:
         """Plan where the law, past what rests, would be held or much later than on the free way Q (k, n)."""
         free = takes = STEP * len(Q)
-        if self.plans and self._is_met(site, Q):
-            takes = self._law_takes(site, goal)
+        if self.plans and is_met(site, Q):
+            takes = law_takes(site, goal, self.given)
         self._expect(m, takes if takes < np.inf else free)
-        return self._planned(m, goal, site, takes) if takes > _late(free) else None
+        return self._planned(m, goal, site, takes) if takes > late(free) else None
 
     def _led(self, m: Seen, goal: Goal, site: Site, straight: F64) -> Advice:
         """Lead the joints straight, or along a planned way where that takes much longer than the tip would, and it."""
-        takes = self._lasts(site, straight)
-        if self.plans and takes > _late(self._tip_takes(site, goal)):
+        takes = joints_take(site, straight)
+        if self.plans and takes > late(tip_takes(site, goal)):
             planned = self._planned(m, goal, site, takes)
             if planned is not None:
                 return planned
-        return heading(site, self._take(site, straight), 0, False)
-
-    def _lasts(self, site: Site, path: F64) -> float:
-        return lasts(site.chain, path, plan.speeds_of(self.robot))
-
-    def _tip_takes(self, site: Site, goal: Goal) -> float:
-        """Return the time [s] of the tip straight to the goal."""
-        far, turned = self._missed(site, goal)
-        return max(far / self.robot.motion.v_max, turned / self.robot.motion.w_max)
+        return self._take(site, straight)
 
     def _overdue(self, m: Seen, goal: Goal) -> Advice | None:
         """Plan for an arm that moves, where it will be held or late."""
         site = self._site(m)
         self.watch = m.tick + round(WATCH / self.robot.dt)
-        left, was = self._tip_takes(site, goal), self.left
+        left, was = tip_takes(site, goal), self.left
         self.left = left
         if not moves(site) and left > was - min(CREEPS * was, CREEPS * WATCH):
             return self._planned(m, goal, site)
-        takes = self._law_takes(site, goal)
+        takes = law_takes(site, goal, self.given)
         if takes < LATEST or m.tick + takes / self.robot.dt < self.late:
             return None
         if takes < np.inf:
@@ -300,29 +279,8 @@ class Guide:
     def _expect(self, m: Seen, takes: float) -> None:
         """Take note of when an arm should be there that takes so long [s]."""
         if self.plans:
-            self.late = m.tick + round(_late(takes) / self.robot.dt)
+            self.late = m.tick + round(late(takes) / self.robot.dt)
             self.watch, self.left = m.tick + round(WATCH / self.robot.dt), np.inf
-
-    def _law_takes(self, site: Site, goal: Goal) -> float:
-        """Return the time [s] in which the law gets there past what rests, infinite where that holds it."""
-        keep, rest = self.robot.avoid.rho_min, self.robot.q_rest
-        if self.given is not None:
-            keep, rest = min(keep, self.given.rho), self.given.q
-        Q, there = previewed(site, goal, rest, self._dulled(site), keep)
-        return STEP * len(Q) if there else np.inf
-
-    def _dulled(self, site: Site) -> F64:
-        """Return an inertia (n, n) [kg m2] of which light joints have more: pushed aside, they are damped as well."""
-        A = inertia_of(site)
-        out: F64 = A + DULL * A.diagonal().max() * np.eye(self.robot.n)
-        return out
-
-    def _is_met(self, site: Site, Q: F64) -> bool:
-        """Return whether something that rests is in the way Q (k, n)."""
-        o, keep = site.obstacles, self.robot.avoid.rho_min
-        rests = o._replace(active=o.active & ~(o.v.any(axis=1) | o.w.any(axis=1)))
-        rho = clearance_of(site.chain, self.robot.points, Q, rests, self.robot.avoid.rho0)
-        return bool(rho.min() < min(keep, 0.9 * min(rho[0], rho[-1])))
 
     def _endings(self, site: Site, goal: Goal) -> list[Ending]:
         """Return postures that have the goal, as far from joint limits as there are any."""
@@ -373,7 +331,7 @@ class Guide:
         self.ends = self._endings(site, goal)
         far = [end for end in self.ends if np.abs(end.q - site.start).max() > 3.0 * NEAR]
         straight = next((way for end in far if (way := self._straight(site, end)) is not None), None)
-        return None if straight is None else heading(site, self._take(site, straight), 0, False)
+        return None if straight is None else self._take(site, straight)
 
     def _planned(self, m: Seen, goal: Goal, site: Site, takes: float = np.inf) -> Advice | None:
         """Take a planned way, None where there is none beside which the law, which `takes` so long [s], is late."""
@@ -393,54 +351,45 @@ class Guide:
             self.told = why
             self.again = m.tick + round(min(self.tries, PLANS) * AGAIN / self.robot.dt)
             return None
-        if takes < _late(self._lasts(site, path)):
+        if takes < late(joints_take(site, path)):
             return None
         self.events.append(("planned", f"a way of {len(path)} postures around what holds the arm"))
-        return heading(site, self._take(site, path), 0, False)
+        return self._take(site, path)
 
-    def _take(self, site: Site, path: F64) -> Way:
-        self.way = way_of(site, path)
-        self.at, self.moved_at, self.waits_since, self.blocked = 0, -1, -1, False
-        return self.way
+    def _take(self, site: Site, path: F64) -> Advice:
+        self.course = Course(site, path)
+        return self.course.first(site)
 
     # -- along a way -------------------------------------------------------------------------------------------------
 
-    def _along(self, m: Seen, goal: Goal, way: Way, changed: bool) -> Advice | None:
-        site, dt, at = self._site(m), self.robot.dt, progress(way, self.at, m.q)
-        if at > self.at or self.moved_at < 0:
-            self.at, self.moved_at = at, m.tick
-        if np.abs(m.q - way.Q[-1]).max() < NEAR and travelled(site, way.Q[-1:])[0] < NEARLY:
-            self.way, self.again = None, m.tick + round(AGAIN / dt)
-            return self._given(way.end)
-        if changed or ((self.blocked or moves(site)) and m.tick >= self.look):
+    def _along(self, m: Seen, goal: Goal, course: Course, changed: bool) -> Advice | None:
+        site, dt = self._site(m), self.robot.dt
+        course.come(m.tick, m.q)
+        if course.ended(site):
+            self.course, self.again = None, m.tick + round(AGAIN / dt)
+            return self._given(course.way.end)
+        if changed or ((course.blocked or moves(site)) and m.tick >= self.look):
             self.look = m.tick + round(LOOK / dt)
-            self.blocked = comes(site, way, self.at)
-        if self.blocked:
-            return self._yield(m, goal, site, way)
-        self.waits_since = -1
-        if (m.tick - self.moved_at) * dt > STUCK:
-            self.way = None
-            return self._planned(m, goal, site) if self.plans else self._given(way.end)
-        return heading(site, way, self.at, True)
+            course.look(site)
+        if course.blocked:
+            return self._yield(m, goal, site, course)
+        course.goes()
+        if course.stuck(m.tick, dt):
+            self.course = None
+            return self._planned(m, goal, site) if self.plans else self._given(course.way.end)
+        return course.on(site)
 
-    def _yield(self, m: Seen, goal: Goal, site: Site, way: Way) -> Advice | None:
+    def _yield(self, m: Seen, goal: Goal, site: Site, course: Course) -> Advice | None:
         """Yield to what moves; after a while look for another way."""
-        self.moved_at = m.tick
-        if self.waits_since < 0:
-            self.waits_since = m.tick
+        if not course.waits(m.tick):
             self.events.append(("yields", "to what moves across the way"))
-        if (m.tick - self.waits_since) * self.robot.dt > PATIENCE:
-            self.waits_since, self.way = m.tick, None
-            return self._planned(m, goal, site) if self.plans else None
-        return yielding(site, way, self.at)
+        if course.patient(m.tick, self.robot.dt):
+            return course.aside(site)
+        self.course = None
+        return self._planned(m, goal, site) if self.plans else None
 
     def _forget(self) -> None:
-        self.way, self.given, self.ends = None, None, []
-        self.at, self.moved_at, self.waits_since, self.look, self.again, self.tries = 0, -1, -1, 0, 0, 0
+        self.course, self.given, self.ends = None, None, []
+        self.look = self.again = self.tries = 0
         self.late, self.watch, self.left, self.nearest, self.kept = -1, 0, np.inf, np.inf, None
-        self.blocked, self.told, self.scene = False, "", b""
-
-
-def _late(takes: float) -> float:
-    """Return the time [s] after which an arm is late that could take so long [s]."""
-    return LATER * takes + LATEST
+        self.told, self.scene = "", b""
