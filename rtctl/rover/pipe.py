@@ -11,16 +11,15 @@ from rtctl.kernel import reductions as scans
 from rtctl.rover import estimator, law, legs, occupancy, outline, path, turn
 from rtctl.rover.faults import BIT, FAULTS, Counters, severity
 from rtctl.rover.memory import NO_LOOK, BaseMemory
-from rtctl.rover.record import make_base_record
+from rtctl.rover.perception import perceived, surroundings
+from rtctl.rover.record import Judged, recorded
 from rtctl.rover.robot import SECTORS, Base, Wheels
 from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word, at_rest
-from rtctl.rover.supervision import detected, driving, goal_distance, supervise, with_goal
+from rtctl.rover.supervision import detected, driving, supervise, with_goal
 from rtctl.types import F64, Goal, ObstacleEdit, Record, Request, Severity, Shape, State, Status, Task
 from rtctl.world import obstacle_table
 
 MISSED_MAX = 50  # slots that the estimate coasts through; more is a fault
-NEAR = 6.0  # [m] that returns are looked at around the base
-BEAM_TICKS = 5  # between two looks of the single sensors
 SLOW = 0.25  # of V_max while the position is reckoned, or the autopilot's own estimator is at its bound
 BLIND_SPEED = 0.1  # [m/s] below it the base stands for what it has not seen
 BLIND_TURN = 0.05  # [rad/s] below it the base does not turn for what it has not seen
@@ -32,7 +31,6 @@ TURN_SPEED = 0.05  # [m/s] of v_ref below which the base turns on the spot
 DETOUR = 1.2  # times as long as the straight line, from which on a way is asked whether the outline has a shorter one
 PROGRESS = 0.3  # [m] by which the way must become shorter to count
 SIGHTLESS = BIT["scan_stale"] | BIT["scan_wrong"]
-Judged = tuple[F64, law.Push, F64, float]  # v_ref wanted, field, xd_d, allowed speed
 
 
 def tick(
@@ -43,7 +41,7 @@ def tick(
     elapsed = base.dt * (1 + min(feedback.missed, MISSED_MAX))
     m = _estimated(base, m, feedback, elapsed)
     m = _compared(base, m, elapsed)
-    m = _perceived(base, m, feedback, request, elapsed)
+    m = perceived(base, m, feedback, request, elapsed)
     m, present = detected(base, m, feedback)
     m = supervise(base, m, feedback, request, present)
     m = with_goal(base, m, request)
@@ -52,7 +50,7 @@ def tick(
     m, command = _commanded(base, m, feedback, judged, elapsed)
     m = _diagnosed(base, m)
     m = m._replace(last=feedback)
-    return m, command, _record(base, m, feedback, request, judged, command)
+    return m, command, recorded(base, m, feedback, request, judged, command)
 
 
 def initial(base: Base, feedback: BaseFeedback) -> BaseMemory:
@@ -148,56 +146,6 @@ def _estimated(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> Ba
     )
 
 
-def _perceived(base: Base, m: BaseMemory, f: BaseFeedback, request: Request, elapsed: float) -> BaseMemory:
-    """Told obstacles moved on and edited, a new scan drawn into the chart from where it was taken."""
-    table, refusal = obstacle_table.advanced(m.world, elapsed), m.refusal
-    if request.obstacles:
-        table, refusal = obstacle_table.edited(table, request.obstacles)
-    seen, scans, due = occupancy.moved(m.chart, m.here.x), m.scans, m.due
-    if f.scans and f.scan_age < base.safety.scan_stale:
-        scan = _placed_scan(base, m, f)
-        seen = occupancy.integrate_scan(seen, scan, m.tick - round(f.scan_age / base.dt))
-        k = min(f.sensor, len(scans) - 1)
-        scans, due = (*scans[:k], _returns(scan), *scans[k + 1 :]), min(due, m.tick)
-    if m.tick % BEAM_TICKS == 0 and (f.beams >= 0.0).any():
-        scan = occupancy.PlacedScan(m.here.x, m.here.yaw, -0.25 * math.pi, f.beams, min(f.beam_reach, base.sense))
-        seen = occupancy.integrate_scan(seen, scan, m.tick)
-    if len(base.cover):
-        seen = outline.stood(seen, base.cover, m.here.x, m.here.yaw, m.tick)
-    else:
-        seen = occupancy.stood(seen, m.here.x, base.margins.hull, m.tick)
-    rho = m.goal_rho if m.goal is None else goal_distance(base, table, m.goal)
-    return m._replace(world=table, refusal=refusal, chart=seen, scans=scans, due=due, goal_rho=rho)
-
-
-def _placed_scan(base: Base, m: BaseMemory, f: BaseFeedback) -> occupancy.PlacedScan:
-    """Return the feedback's scan from where its sensor was when it was taken."""
-    x, yaw = m.here.x - f.scan_age * m.here.v, m.here.yaw - f.scan_age * m.here.yaw_rate
-    c, s = math.cos(yaw), math.sin(yaw)
-    at = x + np.array([c * f.scan_offset[0] - s * f.scan_offset[1], s * f.scan_offset[0] + c * f.scan_offset[1]])
-    return occupancy.PlacedScan(at, yaw + f.scan_start, f.scan_step, f.scan, min(f.scan_reach, base.sense))
-
-
-def _returns(scan: occupancy.PlacedScan) -> F64:
-    """Return the points (m, 2) [m] that a scan touched."""
-    hit = (scan.ranges >= 0.0) & (scan.ranges <= scan.reach)
-    angle = scan.angle + scan.step * np.flatnonzero(hit)
-    points: F64 = scan.x + scan.ranges[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return points
-
-
-def _surroundings(m: BaseMemory, f: BaseFeedback) -> tuple[F64, int]:
-    """Return every return (m, 2) [m] near the base, and how many are of the newest scans and single sensors: first."""
-    x, yaw = m.here.x, m.here.yaw
-    parts = [*m.scans]
-    hit = (f.beams >= 0.0) & np.isfinite(f.beams)
-    if hit.any():
-        angle = yaw - 0.25 * np.pi * np.flatnonzero(hit)
-        parts.append(x + f.beams[hit, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    now = sum(map(len, parts))
-    return np.concatenate([*parts, occupancy.returns_near(m.chart, x, NEAR)]), now
-
-
 def _guided(base: Base, m: BaseMemory) -> BaseMemory:
     """Keep the way to the goal; look for it anew when a scan came or its time has."""
     if m.goal is None or m.state != State.RUN:
@@ -256,7 +204,7 @@ def _towards(base: Base, m: BaseMemory, x: F64) -> F64:
 def _law(base: Base, m: BaseMemory, f: BaseFeedback, elapsed: float) -> tuple[BaseMemory, Judged]:
     """Evaluate field and goal at the state that a set-point sent now will meet."""
     x, yaw = _ahead(base, m)
-    seen, now = _surroundings(m, f)
+    seen, now = surroundings(m, f)
     push = law.field(base, m.here.x, m.here.yaw, m.here.v, seen, now, m.world.obstacles)
     moves = driving(m) and m.state == State.RUN and severity(m.in_force) < Severity.SS2
     xd_d, total = np.zeros(2), np.zeros(2)
@@ -368,7 +316,7 @@ def _turned(base: Base, m: BaseMemory, f: BaseFeedback, w: float) -> tuple[BaseM
         return m._replace(dark=0), 0.0
     pose, side, most = np.array([*m.here.x, m.here.yaw]), math.copysign(1.0, w), law.way_of_turn(base)
     coming = side * estimator.wrapped(_ahead(base, m)[1] - m.here.yaw)
-    free = outline.turn_free(base, pose, side, most, _surroundings(m, f)[0], m.world.obstacles)
+    free = outline.turn_free(base, pose, side, most, surroundings(m, f)[0], m.world.obstacles)
     held, dark = w if free >= most else law.held_turn(base, w, free, coming), False
     if base.safety.scan:
         free = outline.turn_seen(base, m.chart, pose, side, most, m.tick - round(base.safety.seen / base.dt))
@@ -415,91 +363,6 @@ def _diagnosed(base: Base, m: BaseMemory) -> BaseMemory:
         return m._replace(status=Status.SHADOWED, blocker=-1)
     holding = int(m.rho.argmin())
     return m._replace(status=Status.LOCAL_MINIMUM, blocker=holding if m.rho[holding] < base.field.rho0 else -1)
-
-
-def _record(
-    base: Base, m: BaseMemory, f: BaseFeedback, request: Request, judged: Judged, command: BaseCommand
-) -> Record:
-    """Write everything that came in and went out into one struct."""
-    v_ref, push, xd_d, allowed = judged
-    goal = m.goal.position if m.goal is not None else np.array([*m.here.x, 0.0])
-    corners = np.zeros((path.CORNERS, 2))
-    corners[: len(m.way.corners)] = m.way.corners
-    return make_base_record(
-        base.slots,
-        tick=m.tick,
-        slot=max(f.slot, 0),
-        time=f.slot * base.dt,
-        missed=f.missed,
-        link=f.link,
-        position=f.position,
-        velocity=f.velocity,
-        yaw=f.yaw,
-        yaw_rate=f.yaw_rate,
-        position_age=f.position_age,
-        attitude_age=f.attitude_age,
-        fresh=f.fresh,
-        reset=f.reset,
-        scan=f.scan,
-        scan_start=f.scan_start,
-        scan_step=f.scan_step,
-        scan_reach=f.scan_reach,
-        scan_age=f.scan_age,
-        scans=f.scans,
-        sensor=f.sensor,
-        scan_offset=f.scan_offset,
-        scan_wrong=f.scan_wrong,
-        known_age=f.known_age,
-        beams=f.beams,
-        beam_reach=f.beam_reach,
-        heartbeat_age=f.heartbeat_age,
-        uplink_age=f.uplink_age,
-        fix_lost=f.fix_lost,
-        quality=f.quality,
-        ours=f.ours,
-        mode=f.mode,
-        armed=f.armed,
-        reboots=f.reboots,
-        healthy=f.healthy,
-        word=f.word,
-        lost=f.lost,
-        refused=f.refused,
-        verb=request.verb,
-        lateness=f.lateness,
-        compute=f.compute,
-        x=[*m.here.x, 0.0],
-        xd=[*m.here.v, 0.0],
-        heading=m.here.yaw,
-        innovation=m.innovation,
-        goal=goal,
-        goal_heading=math.nan if m.goal is None else turn.heading_of(m.goal),
-        error=float(np.hypot(*(goal[:2] - m.here.x))),
-        error_rot=0.0 if m.goal is None else turn.left(m.goal, m.here.yaw),
-        way=corners,
-        corners=len(m.way.corners),
-        way_length=m.way.length,
-        way_short=m.way.short,
-        rho=push.rho,
-        push_told=push.known,
-        rho_seen=push.rho_sensed,
-        push_seen=push.sensed,
-        xd_d=xd_d,
-        v_ref=v_ref,
-        allowed=allowed,
-        allowed_seen=m.allowed_seen,
-        bias=m.here.b,
-        asked=m.asked,
-        did=m.did,
-        v=command.v,
-        w=command.w,
-        v_world=command.velocity,
-        command=command.ask,
-        state=m.state,
-        status=m.status,
-        blocker=m.blocker,
-        severity=m.reaction,
-        faults=m.in_force,
-    )
 
 
 def warm(base: Base) -> None:
