@@ -554,3 +554,22 @@ def test_a_posture_measured_among_other_obstacles_is_not_trusted_beside_a_new_on
         assert not here.memory.refusal
         assert here.memory.goal is not None
         np.testing.assert_array_equal(here.memory.goal.posture, HOME)
+
+
+@pytest.mark.parametrize(("late", "held"), [(10, True), (1000, False)])
+def test_joints_at_the_goal_are_held_back_by_how_fast_they_drift_now(late: int, held: bool):
+    """0.15 rad in a hundredth of a second would be in a limit at once; in a second it is nothing."""
+    guide = Guide(robot(), plans=True)
+    guide.begin()
+    first, then = list(HOME), list(HOME)
+    first[6] += 0.3
+    then[6] += 0.45
+    tip = robot().body.evaluate(np.array(first), np.zeros(7), robot().points)
+    goal = Goal(tip.x, UNIT, Task.POSITION, 0.003, 0.015)
+    assert guide.advise(seen(HOME, goal)) is None  # its first look
+    assert guide.advise(seen(first, goal, tick=10, status=Status.ARRIVED)) is None
+    kept = guide.advise(seen(then, goal, tick=10 + late, status=Status.ARRIVED))
+    assert (kept is not None) == held
+    if kept is not None:
+        assert kept.posture.tolist() == first
+        assert not kept.leads

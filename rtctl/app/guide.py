@@ -107,7 +107,7 @@ class Guide:
     ends: list[Ending]
     look: int  # tick of the next look at what comes
     again: int  # tick of the next attempt
-    kept: F64 | None  # (n,) [rad] at the goal, at the last look, where nothing pushed
+    kept: tuple[int, F64] | None  # tick and posture (n,) [rad] at the goal, of the last look, where nothing pushed
     nearest: float  # the tip was to the goal since it had it, of what is tolerated
     late: int  # tick by which the arm should be there; -1: nothing is known of that
     watch: int  # tick of the next look whether it will
@@ -224,7 +224,7 @@ class Guide:
         """
         if goal.streams or self.fresh or self.taught or not (self.robot.postures and self.due(m.tick)):
             return None
-        was, self.kept = self.kept, None
+        last, self.kept = self.kept, None
         to = self.robot.q_rest if goal.posture is None else goal.posture
         if np.abs(m.q - to).max() < NEAR:
             return None
@@ -234,8 +234,10 @@ class Guide:
         far, turned = missed(site, goal)
         away = max(far / goal.tolerance, turned / goal.tolerance_rot)
         self.nearest = min(self.nearest, away)
-        if free_of_all(site, m.q if was is None else m.q + SOON / PERIOD * (m.q - was)):
-            was, self.kept = None, m.q
+        since = np.inf if last is None else (m.tick - last[0]) * self.robot.dt
+        was = last[1] if last is not None and since <= SOON else None  # longer ago it was another motion
+        if free_of_all(site, m.q if was is None else m.q + SOON / since * (m.q - was)):
+            was, self.kept = None, (m.tick, m.q)
         if (was is None and away < self.nearest + DRIFTED) or m.tick < self.again:
             return None
         keep, self.nearest, self.again = m.q if was is None else was, away, m.tick + round(AGAIN / self.robot.dt)
