@@ -187,7 +187,7 @@ def test_the_tip_is_not_pushed_past_its_speed(tau: F64, direction: list[float], 
     u = np.array(direction) / size
     model = model_at(PANDA_HOME, np.zeros(7))
     rows, most = np.zeros((2, 7)), np.zeros(2)
-    tip_bounds(TipMotion(model.J, np.zeros(6), v * u, np.zeros(7)), model.A_inv, 0.5, RATE, rows, most)
+    tip_bounds(TipMotion(model.J, np.zeros(6), v * u, np.zeros(7)), model.A, model.A_inv, 0.5, RATE, rows, most)
     low = np.full(7, -1e6)
     added, acts = guard(model.A, model.A_inv, tau, low, -low, rows, most)
     before, after = (u @ model.J[:3] @ model.A_inv @ t for t in (tau, tau + added))
@@ -204,7 +204,7 @@ def pushed_about(push: Callable[[F64], F64], v: F64, step: float) -> float:
     eye, low, sent, top = np.eye(3), np.full(3, -1e6), np.zeros(3), 0.0
     for _ in range(2000):
         rows, most = np.zeros((2, 3)), np.zeros(2)
-        tip_bounds(TipMotion(np.eye(6)[:, :3], np.zeros(6), v, sent), eye, 0.5, np.full(3, 1e3 * step), rows, most)
+        tip_bounds(TipMotion(np.eye(6)[:, :3], np.zeros(6), v, sent), eye, eye, 0.5, np.full(3, 1e3 * step), rows, most)
         wanted = push(v)
         for _ in range(2):  # what the guards let pass, then what the limiter leaves of it
             wanted = wanted + guard(eye, eye, wanted, low, -low, rows, most)[0]
@@ -239,7 +239,7 @@ def test_a_tip_that_brakes_gently_is_not_touched():
     rows, most = np.zeros((2, 3)), np.zeros(2)
     for v in (0.49, 0.3, 0.1, 0.01):
         tip = TipMotion(np.eye(6)[:, :3], np.zeros(6), np.array([v, 0.0, 0.0]), np.array([-5.0, 0.0, 0.0]))
-        tip_bounds(tip, np.eye(3), 0.5, np.full(3, 200.0), rows, most)
+        tip_bounds(tip, np.eye(3), np.eye(3), 0.5, np.full(3, 200.0), rows, most)
         assert (rows @ tip.qdd < most).all()
 
 

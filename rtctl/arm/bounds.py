@@ -131,12 +131,22 @@ def _tip_along(tip: TipMotion, x: float, y: float, z: float, rows: F64, r: int) 
 
 
 @leaf_kernel
-def tip_bounds(tip: TipMotion, A_inv: F64, v_max: float, tau_rate: F64, rows: F64, most: F64) -> None:
+def slew_time(A: F64, qdd: F64, tau_rate: F64) -> float:
+    """Return how long [s] torque is slewed until accelerations qdd (n,) [rad/s2] are none, all joints as one."""
+    longest = 0.0
+    for i in range(qdd.shape[0]):
+        longest = max(longest, abs(dot(A, i, qdd)) / tau_rate[i])
+    return longest
+
+
+@leaf_kernel
+def tip_bounds(tip: TipMotion, A: F64, A_inv: F64, v_max: float, tau_rate: F64, rows: F64, most: F64) -> None:
     """Write the TIP_ROWS first rows and bounds of row qdd that keep the tip's speed below v_max [m/s].
 
-    Along its velocity v, and along p = v + a |a|/(2 j), what that comes to when its acceleration a is taken back from
-    now on at the jerk j: an acceleration across a fast tip's way, or one that turns it round, makes it no faster now,
-    and is too large to be taken back by the time it does.
+    Along its velocity v, and along p = v + a T/2, what that comes to when its acceleration a is taken back from now on
+    within T: at the jerk along its own way, or by joints that are slewed as one, whichever takes longer. An
+    acceleration across a fast tip's way, or one that turns it round, makes it no faster now, and is too large to be
+    taken back by the time it does.
 
     The motion task never asks for more than v_max; a field that shoves the arm may. inf while the tip is slow.
     """
@@ -148,7 +158,8 @@ def tip_bounds(tip: TipMotion, A_inv: F64, v_max: float, tau_rate: F64, rows: F6
         x, y, z = x + J[0, i] * tip.qdd[i], y + J[1, i] * tip.qdd[i], z + J[2, i] * tip.qdd[i]
     if x * x + y * y + z * z > 0.0:
         size = _tip_along(tip, x, y, z, rows, 1)
-        back = 0.5 * size / max(jerk_along(rows, 1, mobility(A_inv, rows, 1), tau_rate), 1e-9)  # [s]
+        back = size / max(jerk_along(rows, 1, mobility(A_inv, rows, 1), tau_rate), 1e-9)  # [s]
+        back = 0.5 * max(back, slew_time(A, tip.qdd, tau_rate))
         x, y, z = v[0] + back * x, v[1] + back * y, v[2] + back * z
         peak, along = math.sqrt(x * x + y * y + z * z), v[0] * x + v[1] * y + v[2] * z
         if peak >= TIP_SLOW * v_max and along < ALIGNED * peak * speed:

@@ -1,8 +1,8 @@
 """Guards on the law's torque: nothing is driven to where it could not be held any more.
 
-They bound accelerations, qdd = A^-1 tau with tau all torque but gravity and Coriolis: of every joint, by its speed and
-by what still stops it before its limit; of the tip, by v_max; and of every link near an obstacle or another link, by
-what still stops its own approach before they touch (`bounds`, `nearby`).
+They bound accelerations, qdd = A^-1 tau with tau all torque but gravity, Coriolis and viscous friction: of every joint,
+by its speed and by what still stops it before its limit; of the tip, by v_max; and of every link near an obstacle or
+another link, by what still stops its own approach before they touch (`bounds`, `nearby`).
 
 Where a bound is passed, the accelerations that come nearest in A's norm and keep all of them take the place of those
 wanted (Gauss: as if mechanical stops held the arm there; `least_change`). Cutting a joint's own acceleration alone

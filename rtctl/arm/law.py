@@ -196,9 +196,8 @@ def prepared(robot: Robot) -> Robot:
 
 
 # rows of the work array of a tick, (rows, n): first the four of `osc.motion_torque`, last those of the bounds
-_DQ, _QD_MAX, _SELF, _LIMITS, _REPEL, _LOAD, _DRIVE, _KEEP, _LOW, _HIGH, _DIAGONAL, _SUM, _SENT, _LESS, _AIM, _ROWS = (
-    range(4, 20)
-)
+_DQ, _QD_MAX, _SELF, _LIMITS, _REPEL, _LOAD, _DRAG, _DRIVE, _KEEP, _LOW, _HIGH, _DIAGONAL = range(4, 16)
+_SUM, _SENT, _LESS, _AIM, _ROWS = range(16, 21)
 
 
 class Cover(NamedTuple):
@@ -340,9 +339,22 @@ def _bound(constants: Record, model: Model, motion: Motion, w: F64, most: F64) -
     p, limits = params_of(constants[0], n), motion_limits(constants[0], n, motion.speed_scale, w[_QD_MAX])
     joint_bounds(model.A, motion.q, motion.qd, limits, bounds.low, bounds.high)
     tip = TipMotion(model.J, model.Jdqd, motion.actual.linear, motion.qdd)
-    tip_bounds(tip, model.A_inv, p.motion.v_max, limits.tau_rate, bounds.rows, most)
+    tip_bounds(tip, model.A, model.A_inv, p.motion.v_max, limits.tau_rate, bounds.rows, most)
     pairs = SelfPairs(model.own_rho, model.own_row, w[_DQ])
     self_bounds(pairs, model.A_inv, motion.qd, approach_params(constants[0]), limits.tau_rate, bounds)
+
+
+@leaf_kernel
+def _count_drag(c: RecordRow, qd: F64, w: F64) -> None:
+    """Move the viscous friction that is not fed forward from what accelerates the arm to its load.
+
+    The law leaves it to brake what moves. The guards count with accelerations: friction of one joint may well be what
+    makes the tip faster, where that joint turned against the others.
+    """
+    for i in range(qd.shape[0]):
+        w[_DRAG, i] = (c.viscous[i] - c.viscous_told[i]) * qd[i]
+        w[_LOAD, i] += w[_DRAG, i]
+        w[_SUM, i] -= w[_DRAG, i]
 
 
 @leaf_kernel
@@ -399,12 +411,13 @@ def _slewed(c: RecordRow, sent: F64, w: F64) -> bool:
 def _write(w: F64, share: float, torques: F64) -> None:
     """Write the rows of Law.torques."""
     for i in range(w.shape[1]):
-        guard = w[_SENT, i] - w[_DRIVE, i] - w[_KEEP, i]
+        guard = w[_SENT, i] + w[_DRAG, i] - w[_DRIVE, i] - w[_KEEP, i]
+        load = w[_LOAD, i] - w[_DRAG, i]
         torques[MOTION, i] = share * w[TASK_DRIVE, i] + w[TASK_BRAKE, i]
         torques[POSTURE, i] = share * w[POSTURE_SPRING, i] + w[POSTURE_DAMPER, i]
         torques[OBSTACLES, i], torques[LIMITS, i] = w[_REPEL, i], w[_LIMITS, i] + guard
-        torques[LOAD, i], torques[DRIVE, i] = w[_LOAD, i], w[_DRIVE, i]
-        torques[KEEP, i] = w[_LOAD, i] + w[_KEEP, i] + guard
+        torques[LOAD, i], torques[DRIVE, i] = load, w[_DRIVE, i]
+        torques[KEEP, i] = load + w[_KEEP, i] + guard
 
 
 @leaf_kernel
@@ -436,6 +449,7 @@ def law(
     work = _work_in(memory, seen.leader.shape[0], cover.radius.shape[0], n, model.own_rho.shape[0])
     rho_self, flags, share = _torques(constants, cover, seen, model, space, obstacles, motion, out.task, work.w)
     _bound(constants, model, motion, work.w, work.most)
+    _count_drag(constants[0], motion.qd, work.w)
     acts = False
     if not _let_pass(constants, cover, seen, model, motion, work):
         acts = _hold_back(constants, cover, seen, model, motion, work)
