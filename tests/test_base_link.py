@@ -21,7 +21,7 @@ from firmware_sim import rover
 from firmware_sim.rover_serve import open_port
 from rtctl.app.rover_link import open_link
 from rtctl.errors import EXIT_FAILED, AbsentError, HandshakeError, LinkError, StoppedError
-from rtctl.hal.mavlink.link import dialect
+from rtctl.hal.mavlink.message import dialect
 from rtctl.hal.mavlink.talk import Order, Talk, Word, stream
 from rtctl.hal.mavlink.view import Clock, local_of
 from rtctl.hal.mavlink.wire import InProcess, Udp, open_wire

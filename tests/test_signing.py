@@ -10,7 +10,7 @@ from pamoja import mavlink as pamoja
 
 from rtctl.errors import ConfigError
 from rtctl.hal.mavlink.keys import LEASE, Keys
-from rtctl.hal.mavlink.link import dialect
+from rtctl.hal.mavlink.message import dialect
 from rtctl.protocol import signing
 from rtctl.protocol.signing import NOTHING, State, Verdict
 from rtctl.spec.base import read_key

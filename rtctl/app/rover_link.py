@@ -8,8 +8,9 @@ from pathlib import Path
 from rtctl.app.vehicle import Say, never
 from rtctl.design.rover import key_of
 from rtctl.hal.mavlink.keys import Keys
-from rtctl.hal.mavlink.link import MavLink, MavSpec
+from rtctl.hal.mavlink.link import MavLink
 from rtctl.hal.mavlink.ranging import ANY, ANY_BEAM, SensorSpec
+from rtctl.hal.mavlink.stacks import MavSpec
 from rtctl.hal.mavlink.wire import Wire, open_wire
 from rtctl.rover.signals import BaseFeedback
 from rtctl.spec.base import BaseConfig, streams

@@ -1,102 +1,33 @@
-"""The link to an autopilot: MAVLink 2 bytes in, `BaseFeedback` out; commands in, bytes out. One thread, no waiting.
-
-Frames are judged (signature, ids, checksum) before anything parses them. Nothing the vehicle does not confirm is
-believed: modes and arming are what its heartbeat says.
-"""
+"""The link to an autopilot: MAVLink 2 bytes in, `BaseFeedback` out; commands in, bytes out. One thread, no waiting."""
 
 import math
-import os
-import struct
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.hal.mavlink.message import Message
-
-os.environ["MAVLINK20"] = "1"  # before pymavlink is imported: it starts as MAVLink 1 otherwise
-from pymavlink.dialects.v20 import ardupilotmega as dialect
-
-from rtctl.errors import AbsentError, HandshakeError, StoppedError
+from rtctl.errors import AbsentError, StoppedError
+from rtctl.hal.mavlink.hearing import Hearing
 from rtctl.hal.mavlink.keys import Keys
-from rtctl.hal.mavlink.ranging import SensorSpec
+from rtctl.hal.mavlink.message import Message, dialect
+from rtctl.hal.mavlink.stacks import ONLY, STACKS, STREAMS, MavSpec
+from rtctl.hal.mavlink.steering import STILL, Steering
 from rtctl.hal.mavlink.talk import Order, Talk, request, stream
-from rtctl.hal.mavlink.view import View, enu, local_of
-from rtctl.hal.mavlink.wire import Address, Wire
-from rtctl.protocol import signing
+from rtctl.hal.mavlink.view import View, local_of
+from rtctl.hal.mavlink.wire import Wire
 from rtctl.protocol.mavlink_budget import QUICK
-from rtctl.rover.signals import Ask, BaseCommand, BaseFeedback, Word
+from rtctl.rover.signals import BaseCommand, BaseFeedback
 
 HEARTBEAT = 1.0  # [s] between ours
 TIMESYNC = 0.5  # [s]
 SILENT = 1.0  # [s] without a position from a vehicle that is there: its streams are asked for anew
 TIMESYNC_FAST = 0.1  # [s] until clocks are agreed
-PRESTREAM = 1.3  # [s] of set-points before PX4 may be asked for OFFBOARD: it wants more than one
-WINDOW = 64  # sequence numbers within which a late message is no loss
-AUTOPILOT1 = 1  # component id of an autopilot
-ARM, MODE = 400, 176
-VELOCITY_YAW_RATE = 0x05C7  # of SET_POSITION_TARGET_LOCAL_NED: velocity and yaw rate count
-VELOCITY = 0x0DC7  # velocity alone
-LOCAL_NED, BODY_NED = 1, 8
 EVENTS_MAX = 200  # lines kept
 BACKLOG = 100_000  # frames of the handshake that are kept for the log
 SETTLE, FRESH = 2.0, 0.1  # [s] for the state of now after the handshake; what counts as that
 PROGRESS = 5.0  # [s] between two lines on what is waited for
 ORIGIN = 3.0  # [s] between two questions for the origin, while it is not known
 ASKING = 8.0  # [s] after which settings that the vehicle does not tell are waited for no more
-
-
-class Stack(NamedTuple):
-    """How one autopilot wants to be spoken to."""
-
-    autopilot: int  # MAV_AUTOPILOT
-    ours: int  # custom_mode in which it takes our set-points
-    enter: tuple[float, float]  # its main and sub mode, for DO_SET_MODE
-    hold: tuple[float, float]
-    world: bool  # takes a world velocity
-    prestream: float  # [s] of set-points before the mode
-    parameters: tuple[str, ...]  # reported at connect: what may fight or stop us
-
-
-STACKS = {
-    "ardupilot": Stack(
-        3,
-        15,
-        (15.0, 0.0),
-        (4.0, 0.0),
-        False,
-        0.0,
-        ("AVOID_ENABLE", "OA_TYPE", "PRX1_TYPE", "FS_GCS_ENABLE", "MAV_GCS_SYSID", "SYSID_MYGCS"),
-    ),
-    "px4": Stack(12, 6 << 16, (6.0, 0.0), (4.0, 3.0), True, PRESTREAM, ("COM_OF_LOSS_T", "COM_OBL_RC_ACT")),
-}
-STREAMS = {  # name -> (message id, Hz)
-    "LOCAL_POSITION_NED": (32, 50.0), "ATTITUDE": (30, 50.0), "ODOMETRY": (331, 50.0), "OBSTACLE_DISTANCE": (330, 10.0),
-    "DISTANCE_SENSOR": (132, 10.0), "EKF_STATUS_REPORT": (193, 10.0), "ESTIMATOR_STATUS": (230, 10.0),
-    "GPS_RAW_INT": (24, 5.0), "GLOBAL_POSITION_INT": (33, 2.0), "HOME_POSITION": (242, 1.0),
-}  # fmt: skip
-ONLY = {  # left out
-    "ardupilot": ("ODOMETRY", "ESTIMATOR_STATUS", "OBSTACLE_DISTANCE"),
-    "px4": ("EKF_STATUS_REPORT", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "HOME_POSITION"),
-}
-ROVERS = (10, 11)  # MAV_TYPE: ground rover, surface boat
-
-
-class MavSpec(NamedTuple):
-    """What the link needs to know."""
-
-    place: str  # named in refusals
-    autopilot: str
-    system: int
-    component: int
-    vehicle: int | None
-    period: float  # [s]
-    timeout: float  # [s] that the handshake waits for what is not there yet; infinite: for ever
-    scan: bool  # a scan is required
-    sensors: tuple[SensorSpec, ...]
-    quick: float = math.inf  # [Hz] of position and attitude, where the line bears no more
-    every: int = 1  # period in which a set-point goes out
 
 
 class MavLink:
@@ -108,30 +39,32 @@ class MavLink:
         self.events: deque[str] = deque(maxlen=EVENTS_MAX)  # what people should read: refusals, texts of the vehicle
         self.view = View(self.events.append, spec.sensors, spec.autopilot)
         self.talk = Talk()
+        self.hearing = Hearing(spec, wire, keys, self.view, self.talk, self.events.append)
         self.received: list[bytes] = []  # frames of this cycle as they came
-        self.vehicle: tuple[int, int] | None = None  # pinned (system, component)
-        self.counts: dict[str, int] = {}
         self._mav = dialect.MAVLink(None, srcSystem=spec.system, srcComponent=spec.component)
-        self._rest: dict[Address, bytes] = {}
-        self._seen: deque[int] = deque(maxlen=WINDOW)
-        self._newest = -1  # sequence number, unwrapped
-        self._refused = self._lost = 0
+        self.steering = Steering(self.stack, spec.every, self.view, self.talk, self._mav, self.events.append)
         self._heartbeat_due = self._sync_due = -math.inf
-        self._ask, self._asked_at = Ask.SILENCE, 0.0
-        self._setpoints_since = -1.0
-        self._turn = 0  # periods since set-points are streamed
-        self._word = Word.PENDING
         self._reboots = 0
         self._subscribed = math.inf  # [s] when streams were asked for
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG)  # of the handshake, until the loop's first read
         self._origin_asked = math.inf  # [s]
-        self._strangers: set[tuple[int, int]] = set()
+
+    @property
+    def vehicle(self) -> tuple[int, int] | None:
+        """Its (system, component), once it was heard."""
+        return self.hearing.vehicle
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How much else came, by what it was."""
+        return self.hearing.counts
 
     # -- reading -------------------------------------------------------------------------------------------------
 
     def read(self, slot: int, missed: int, lateness: float, compute: float) -> BaseFeedback:
         """Return what is known of the vehicle at this slot; the loop's first has all packets since the start."""
-        self._drain()
+        self.hearing.drain()
+        self.received = self.hearing.frames
         if slot < 0:
             self._backlog.extend(self.received)
         elif self._backlog:
@@ -179,113 +112,13 @@ class MavLink:
             armed=v.armed,
             reboots=v.reboots,
             healthy=v.healthy,
-            word=int(self._word),
-            lost=self._lost,
-            refused=self._refused,
+            word=int(self.steering.word),
+            lost=self.hearing.lost,
+            refused=self.hearing.refused,
             link=self.wire.flags(),
             lateness=lateness,
             compute=compute,
         )
-
-    def _drain(self) -> None:
-        self.view.cycle()
-        self.received, self._refused, self._lost = [], 0, 0
-        now = self.wire.now()
-        for data, address in self.wire.receive():
-            frames, rest, junk = signing.split(self._rest.pop(address, b"") + data)
-            self._rest = {address: rest[-signing.LONGEST :]} if rest else {}
-            self._count("junk", junk)
-            for frame in frames:
-                self.received.append(frame.raw)
-                self._judge(frame, address, now)
-
-    def _judge(self, frame: signing.Frame, address: Address, now: float) -> None:
-        """Let a frame through that is signed (if it must be), the vehicle's, known and whole."""
-        verdict = self.keys.judge(frame)
-        if verdict == signing.Verdict.GOOD and frame.message not in dialect.mavlink_map:
-            verdict = signing.Verdict.UNKNOWN
-        if verdict != signing.Verdict.GOOD:
-            self._refused += verdict != signing.Verdict.UNKNOWN
-            self._count(verdict.name.lower(), 1)
-            return
-        try:
-            message = self._mav.decode(bytearray(frame.raw))
-        except (dialect.MAVError, struct.error, ValueError, TypeError):
-            self._refused += 1
-            self._count("damaged", 1)
-            return
-        source = (frame.system, frame.component)
-        if self.vehicle is None:
-            self._discover(message, source, address)
-        if self.vehicle is None or source != self.vehicle:
-            if self.vehicle is None or not self.view.sensed(message, source, self.vehicle[0], now):
-                self._count("of others", 1)
-            return
-        if address is not None:
-            self.wire.pin(address)
-        self._sequence(frame.sequence)
-        if message.get_type() == "COMMAND_ACK":
-            self._acknowledged(message, now)
-            return
-        if self.view.sensed(message, source, source[0], now):
-            return
-        self.view.take(message, now)
-
-    def _acknowledged(self, message: Message, now: float) -> None:
-        """Take a COMMAND_ACK that is for us."""
-        for_us = message.target_system in (0, self.spec.system) and message.target_component in (0, self.spec.component)
-        if for_us and self.talk.answer(int(message.command), int(message.result), now):
-            self.view.answered(now)
-
-    def _discover(self, message: Message, source: tuple[int, int], address: Address) -> None:
-        """Pin the vehicle by its heartbeat; others are passed over, and told of once.
-
-        HandshakeError when the one that the config names by its id is another kind than it says: a file can cure that.
-        """
-        spec = self.spec
-        if message.get_type() != "HEARTBEAT" or message.autopilot == 8 or source[1] != AUTOPILOT1:
-            return
-        if spec.vehicle is not None and source[0] != spec.vehicle:
-            return
-        if message.autopilot != self.stack.autopilot:
-            names = {stack.autopilot: name for name, stack in STACKS.items()}
-            got = names.get(message.autopilot, f"autopilot type {message.autopilot}")
-            if spec.vehicle is not None:
-                raise HandshakeError(f"{spec.place}: link.autopilot", f"a heartbeat of {got}", spec.autopilot)
-            self._pass_over(source, got)
-            return
-        if message.type not in ROVERS:
-            self._pass_over(source, f"a vehicle of MAV_TYPE {message.type}")
-            return
-        self.vehicle = source
-        if address is not None:
-            self.wire.pin(address)
-
-    def _pass_over(self, source: tuple[int, int], what: str) -> None:
-        if source not in self._strangers:
-            self._strangers.add(source)
-            self.events.append(f"{source} is {what}: passed over, an {self.spec.autopilot} rover is waited for")
-
-    def _sequence(self, sequence: int) -> None:
-        """Count messages that did not come within a window of later ones; one that is late is no loss."""
-        if self._newest < 0:
-            self._newest = sequence
-            self._seen.extend(range(sequence - WINDOW + 1, sequence + 1))
-            return
-        ahead = (sequence - self._newest + 128) % 256 - 128
-        at = self._newest + ahead
-        if ahead <= 0:
-            if at not in self._seen and ahead > -WINDOW:
-                self._seen.append(at)
-                self._lost = max(self._lost - 1, 0)
-            return
-        self._lost += ahead - 1
-        self._newest = at
-        self._seen.append(at)
-
-    def _count(self, what: str, by: int) -> None:
-        if by:
-            self.counts[what] = self.counts.get(what, 0) + by
 
     # -- writing -------------------------------------------------------------------------------------------------
 
@@ -294,7 +127,7 @@ class MavLink:
         now = self.wire.now()
         messages = self._housekeeping(now)
         if self.vehicle is not None:
-            messages += self._steer(command, now)
+            messages += self.steering.messages(command, self.vehicle, now)
             due = self.talk.due(now)
             if due is not None:
                 messages.append(self._command(*due))
@@ -324,80 +157,6 @@ class MavLink:
         message: Message = sender.command_long_encode(*self.vehicle, order.command, confirmation, *parameters)
         return message
 
-    def _steer(self, command: BaseCommand, now: float) -> list[Message]:
-        """Follow what is asked of the autopilot: its mode, its arming, and set-points while the mode is ours."""
-        if command.ask != self._ask:
-            self._turned(command.ask, now)
-        ours = self.view.mode == self.stack.ours
-        if self._ask == Ask.ENGAGE:
-            self._engage(ours, now)
-        streams = self._ask in (Ask.DRIVE, Ask.HOLD) and ours
-        if self._ask == Ask.ENGAGE:
-            streams = ours or self.stack.prestream > 0.0
-        if not streams:
-            self._setpoints_since = -1.0
-            return []
-        if self._setpoints_since < 0.0:
-            self._setpoints_since, self._turn = now, 0
-        self._turn += 1
-        if (self._turn - 1) % self.spec.every:
-            return []
-        return [self._setpoint(command if self._ask == Ask.DRIVE else command._replace(v=0.0, w=0.0, velocity=_ZERO))]
-
-    def _turned(self, ask: Ask, now: float) -> None:
-        """Forget what was asked before, and ask anew."""
-        self.talk.drop(("mode", "arm", "hold", "disarm"))
-        self._ask, self._asked_at, self._word = ask, now, Word.PENDING
-        if ask == Ask.HOLD:
-            self.talk.give(Order("hold", MODE, (1.0, *self.stack.hold, 0.0, 0.0, 0.0, 0.0)), first=True)
-        elif ask == Ask.DISARM:
-            self.talk.give(Order("disarm", ARM, (0.0,) * 7), first=True)
-
-    def _engage(self, ours: bool, now: float) -> None:
-        """Mode first, then arming; each asked once, repeated by `Talk`, and ended by a refusal."""
-        answers = self.talk.answers
-        for name in ("mode", "arm"):
-            word = answers.get(name, Word.PENDING)
-            if word not in (Word.PENDING, Word.ACCEPTED):
-                if self._word == Word.PENDING:
-                    self.events.append(
-                        f"{'arming' if name == 'arm' else 'our mode'}: {word.name.lower().replace('_', ' ')}"
-                    )
-                self._word = word
-                return
-        streamed = self._setpoints_since >= 0.0 and now - self._setpoints_since >= self.stack.prestream
-        if (
-            not ours
-            and "mode" not in answers
-            and not self.talk.holds("mode")
-            and (streamed or not self.stack.prestream)
-        ):
-            self.talk.give(Order("mode", MODE, (1.0, *self.stack.enter, 0.0, 0.0, 0.0, 0.0)), first=True)
-        if ours and not self.view.armed and "arm" not in answers and not self.talk.holds("arm"):
-            self.talk.give(Order("arm", ARM, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), first=True)
-        if ours and self.view.armed:
-            self._word = Word.ACCEPTED
-
-    def _setpoint(self, command: BaseCommand) -> Message:
-        """Return SET_POSITION_TARGET_LOCAL_NED: forward speed and yaw rate, or for PX4 a velocity in the world."""
-        assert self.vehicle is not None
-        numbers = (command.v, command.w, float(command.velocity[0]), float(command.velocity[1]))
-        if not all(map(math.isfinite, numbers)):
-            numbers = (0.0, 0.0, 0.0, 0.0)  # a NaN has aborted an autopilot; the tick's own checks have failed by now
-        v, w, east, north = numbers
-        if self.stack.world:
-            frame, mask = LOCAL_NED, VELOCITY
-            vx, vy = enu(east, north)
-            w = 0.0
-        else:
-            frame, mask = BODY_NED, VELOCITY_YAW_RATE
-            vx, vy = v, 0.0  # not vy: a skid-steer rover takes hypot(vx, vy) as forward speed
-        boot = round(self.wire.now() * 1e3) & 0xFFFFFFFF
-        message: Message = self._mav.set_position_target_local_ned_encode(
-            boot, *self.vehicle, frame, mask, 0.0, 0.0, 0.0, vx, vy, 0.0, 0.0, 0.0, 0.0, 0.0, -w
-        )
-        return message
-
     # -- the start -----------------------------------------------------------------------------------------------
 
     def handshake(
@@ -417,7 +176,7 @@ class MavLink:
             if self.vehicle is not None and not subscribed:
                 self._subscribe()
                 subscribed, asked_at = True, now
-            self.write(_IDLE)
+            self.write(STILL)
             if subscribed and asked < 2 * len(names) and now >= asked_at:
                 asked, asked_at = asked + 1, now + 0.1  # a parameter takes about that long
                 self._ask_parameter(names[(asked - 1) % len(names)])
@@ -444,7 +203,7 @@ class MavLink:
         until = self.wire.now() + SETTLE
         while True:
             f = self.read(-1, 0, 0.0, 0.0)
-            self.write(_IDLE)
+            self.write(STILL)
             if f.position_age < FRESH or self.wire.now() > until:
                 break
             if not self.received:
@@ -511,7 +270,3 @@ class MavLink:
         """Keep the timestamps and close the wire."""
         self.keys.keep(last=True)
         self.wire.close()
-
-
-_ZERO = np.zeros(2)
-_IDLE = BaseCommand(Ask.SILENCE, 0.0, 0.0, _ZERO)

@@ -1,6 +1,12 @@
-"""A MAVLink message as pymavlink decodes it: one class per message, with a field per attribute."""
+"""A MAVLink message as pymavlink decodes it: one class per message, with a field per attribute; and its dialect."""
 
+import os
 from typing import Any, Protocol
+
+os.environ["MAVLINK20"] = "1"  # before pymavlink is imported: it starts as MAVLink 1 otherwise
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+__all__ = ["Message", "dialect"]
 
 
 class Message(Protocol):
