@@ -9,33 +9,18 @@ import random
 from typing import Any, NamedTuple
 
 from firmware_sim.mav import Endpoint
+from firmware_sim.telemetry import STREAMS
 from firmware_sim.vehicle import Vehicle
 
 GUIDED, HOLD, MANUAL = 15, 4, 0  # custom modes of ArduPilot Rover
 OFFBOARD, LOITER, PX4_MANUAL = 6 << 16, 4 << 16 | 3 << 24, 1 << 16
 SCHEDULER_HZ = 40.0  # the fastest stream of a 50 Hz scheduler
-STREAMS = {
-    32: "local",
-    30: "attitude",
-    331: "odometry",
-    193: "ekf",
-    230: "estimator",
-    49: "origin",
-    24: "gps",
-    33: "global",
-    242: "home",
-    148: "version",
-}
 UNASKED_HZ = 4.0  # of what it streams when nobody may ask
 DEAD_RECKONING = 8.0  # [s] that ArduPilot goes on by its wheels and gyroscopes without a GPS, and says nothing
 BIAS_TURN = 0.05  # [rad/s] by which the bias of the reported speed turns
-POSITION_NOISE, SPEED_NOISE = 0.005, 0.02  # [m], [m/s]
-FIRMWARE = {"ardupilot": 0x040500FF, "px4": 0x010E00FF}  # 4.5.0, 1.14.0
-OLD_FIRMWARE = 0x040000FF  # its local position is relative to home
 EPOCH = 1.79e9  # [s] Unix time when the simulation begins; in real time it is what the clock says
 COAST = 3.0  # [s] that ArduPilot goes on with the last set-point
 GCS_SILENCE = 5.7  # [s] until the GCS failsafe holds, when it is on
-ORIGIN = (-35.363262, 149.165237)  # [deg] of local (0, 0)
 PARAMETERS = {
     "ardupilot": {"AVOID_ENABLE": 0.0, "OA_TYPE": 0.0, "PRX1_TYPE": 0.0, "FS_GCS_ENABLE": 0.0, "MAV_GCS_SYSID": 245.0},
     "px4": {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 0.0},
@@ -152,7 +137,7 @@ class Autopilot:
                 return DENIED
             if int(m.param1) in (49, 242, 32, 33) and not self.positioned:
                 return FAILED
-            self.outbox.append(getattr(self, f"_{STREAMS[int(m.param1)]}")())
+            self.outbox.append(STREAMS[int(m.param1)](self))
             return ACCEPTED
         if m.command == 176:
             return self._enter(m)
@@ -270,7 +255,7 @@ class Autopilot:
     def _wander(self, dt: float) -> None:
         """Let the estimator's errors grow: a bias of the speed that turns, a drift, a position that is reckoned."""
         self.bias_angle += BIAS_TURN * dt
-        east, north = self._bias()
+        east, north = self.bias_now()
         rate = self.drift
         if self.gps_lost_at is not None:
             self.offset = (self.offset[0] + east * dt, self.offset[1] + north * dt)
@@ -280,7 +265,8 @@ class Autopilot:
         if not self.armed:
             self.home = (self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
 
-    def _bias(self) -> tuple[float, float]:
+    def bias_now(self) -> tuple[float, float]:
+        """Return the bias [m/s] of the reported speed, east and north."""
         return self.bias * math.cos(self.bias_angle), self.bias * math.sin(self.bias_angle)
 
     def _failsafes(self) -> None:
@@ -326,112 +312,4 @@ class Autopilot:
             due = self.due.setdefault(message, self.time)
             if self.time >= due - 1e-9:
                 self.due[message] += interval * max(1, math.ceil((self.time - due) / interval))
-                self.outbox.append(getattr(self, f"_{STREAMS[message]}")())
-
-    def _ned(self) -> tuple[float, float, float, float]:
-        v = self.vehicle
-        east, north = (a + b for a, b in zip(v.velocity, self._bias(), strict=True))
-        x, y = v.x + self.offset[0], v.y + self.offset[1]
-        if self.home_relative:
-            x, y = x - self.home[0], y - self.home[1]
-        shake = self.random.gauss
-        return (
-            y + shake(0.0, POSITION_NOISE),
-            x + shake(0.0, POSITION_NOISE),
-            north + shake(0.0, SPEED_NOISE),
-            east + shake(0.0, SPEED_NOISE),
-        )
-
-    def _yaw(self) -> float:
-        return math.remainder(0.5 * math.pi - self.vehicle.yaw, 2.0 * math.pi)
-
-    def _local(self) -> Any:
-        x, y, vx, vy = self._ned()
-        return self.end.codec.local_position_ned_encode(self._ms(), x, y, 0.0, vx, vy, 0.0)
-
-    def _odometry(self) -> Any:
-        x, y, vx, vy = self._ned()
-        half = 0.5 * self._yaw()
-        c, s = math.cos(2.0 * half), math.sin(2.0 * half)
-        body = (c * vx + s * vy, c * vy - s * vx)
-        q = (math.cos(half), 0.0, 0.0, math.sin(half))
-        none = [math.nan] * 21
-        return self.end.codec.odometry_encode(
-            round(self.uptime * 1e6),
-            1,
-            12,
-            x,
-            y,
-            0.0,
-            q,
-            *body,
-            0.0,
-            0.0,
-            0.0,
-            -self.vehicle.w,
-            none,
-            none,
-            self.resets % 256,
-            2,
-            100,
-        )
-
-    def _attitude(self) -> Any:
-        return self.end.codec.attitude_encode(self._ms(), 0.0, 0.0, self._yaw(), 0.0, 0.0, -self.vehicle.w)
-
-    def _ekf(self) -> Any:
-        flags, variance = (128 | 1, 1.4) if self.estimator_bad else (1 | 2 | 4 | 8 | 16 | 32 | 512, 0.02)
-        if not self.positioned:
-            flags = 1024 if self.uptime < self.cold else 128 | 1 | 2
-        return self.end.codec.ekf_status_report_encode(flags, variance, variance, variance, 0.1, 0.0)
-
-    def _estimator(self) -> Any:
-        bad = self.estimator_bad or not self.positioned
-        flags, ratio = (128 | 1, 2.0) if bad else (1 | 2 | 4 | 8 | 16 | 32, 0.1)
-        stamp = round(self.uptime * 1e6)
-        return self.end.codec.estimator_status_encode(stamp, flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, 0.3, 0.3)
-
-    def _gps(self) -> Any:
-        fix = 1 if self.gps_lost_at is not None or self.uptime < self.cold else 6
-        lat, lon = self._place(self.vehicle.x, self.vehicle.y)
-        return self.end.codec.gps_raw_int_encode(
-            round(self.uptime * 1e6),
-            fix,
-            lat,
-            lon,
-            584000,
-            80 if fix > 3 else 9999,
-            65535,
-            65535,
-            65535,
-            14 if fix > 3 else 2,
-        )
-
-    def _global(self) -> Any:
-        _, _, north, east = self._ned()
-        lat, lon = self._place(self.vehicle.x + self.offset[0], self.vehicle.y + self.offset[1])
-        return self.end.codec.global_position_int_encode(
-            self._ms(), lat, lon, 584000, 0, round(100.0 * north), round(100.0 * east), 0, 65535
-        )
-
-    def _home(self) -> Any:
-        lat, lon = self._place(*self.home)
-        return self.end.codec.home_position_encode(lat, lon, 584000, 0, 0, 0, (1, 0, 0, 0), 0, 0, 0)
-
-    def _version(self) -> Any:
-        firmware = OLD_FIRMWARE if self.home_relative else FIRMWARE[self.kind]
-        return self.end.codec.autopilot_version_encode(
-            0, firmware, 0, 0, 0, b"rtctl-dbl", b"rtctl-dbl", b"rtctl-dbl", 0, 0, 1
-        )
-
-    def _place(self, x: float, y: float) -> tuple[int, int]:
-        """Return latitude and longitude [1e-7 deg] of a place [m] east, north of the origin."""
-        lat = ORIGIN[0] + y / 111318.84502145034
-        lon = ORIGIN[1] + x / (111318.84502145034 * math.cos(math.radians(0.5 * (lat + ORIGIN[0]))))
-        return round(lat * 1e7), round(lon * 1e7)
-
-    def _origin(self) -> Any:
-        return self.end.codec.gps_global_origin_encode(round(ORIGIN[0] * 1e7), round(ORIGIN[1] * 1e7), 584000)
-
-    def _ms(self) -> int:
-        return round(self.uptime * 1e3)
+                self.outbox.append(STREAMS[message](self))

@@ -8,8 +8,8 @@ import numpy as np
 import pybullet
 from scipy.spatial.transform import Rotation
 
-from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.spec.urdf import package_folders, urdf_file
 from rtctl.types import F64
 

@@ -10,7 +10,7 @@ import pytest
 
 from rtctl.arm.apart import hulls_apart
 from rtctl.arm.field import CAPPED, CONTACT, field_params, own_field
-from rtctl.arm.model import RigidBody
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.self_collision import Own, nothing
 from rtctl.design import kept, pairs
 from rtctl.design.pairs import hulls_of, watched

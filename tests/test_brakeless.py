@@ -15,7 +15,7 @@ import pytest
 from rtctl import design
 from rtctl.app.replay import replay
 from rtctl.app.sim import simulate
-from rtctl.arm.model import RigidBody
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.design.arm import rigid_body
 from rtctl.log import schema
 from rtctl.log.read.run import read_run

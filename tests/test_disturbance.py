@@ -9,7 +9,7 @@ import pytest
 
 from rtctl.arm import faults
 from rtctl.arm.disturbance import BANDWIDTH, LASTING, beyond, carried, observed, rounding, settled, slow_part
-from rtctl.arm.memory import fresh, record_of
+from rtctl.arm.hot import fresh, record_of
 from rtctl.arm.sensing import _stick, _surprise
 from rtctl.experiment import rates, scene
 from rtctl.kernel.rotations import quat_of

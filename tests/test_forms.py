@@ -14,11 +14,12 @@ import pytest
 from rtctl import design as cfg
 from rtctl.arm.diagnosis import balance
 from rtctl.arm.field import SUM, TASK, FieldParams, MovingPoints, field, field_buffers
-from rtctl.arm.law import Motion, evaluate_law, nothing_ahead
-from rtctl.arm.model import RigidBody
+from rtctl.arm.law import evaluate_law
 from rtctl.arm.osc import Twist, operational_space
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.robot import Robot
+from rtctl.arm.terms import Motion, nothing_ahead
 from rtctl.control.firas import eta_of, rho_num_of
 from rtctl.errors import ConfigError
 from rtctl.types import F64, State, Status

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtctl.arm.memory import fresh, record_of
+from rtctl.arm.hot import fresh, record_of
 from rtctl.arm.progress import Progress, arrived, at_rest, stall_timer, take_drift, time_left
 from rtctl.arm.target import DIAGNOSE, Target, progress_timers
 from rtctl.control.goals import refusal

@@ -22,8 +22,9 @@ from rtctl.app.simulator import open_simulator
 from rtctl.app.times import dulled
 from rtctl.arm.field import APART, Ends, MovingPoints, field_buffers, field_to
 from rtctl.arm.freedom import Room, body_of, first_blocked
+from rtctl.arm.hot import MEASURED_POSTURE
 from rtctl.arm.kinematics import chain_of, clearance_of, placements, points_at, tip_at
-from rtctl.arm.memory import MEASURED_POSTURE, Memory
+from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import initial
 from rtctl.design.pairs import hulls_of
 from rtctl.errors import PlanError

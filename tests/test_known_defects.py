@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rtctl.arm import law as law_module
-from rtctl.arm import limits, osc, pipe, servo_level, supervision
+from rtctl.arm import limits, osc, pipe, servo_level, supervision, terms
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.control import supervisor
@@ -28,7 +28,7 @@ def model_at(q: F64) -> Model:
     return robot().body.evaluate(q, np.zeros(7), robot().points, robot().own)
 
 
-def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
+def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> terms.Law:
     """Return the law for an arm at rest at q whose tip is to go along e."""
     arm, model = robot(), model_at(q)
     table = obstacles_empty(arm.slots)
@@ -40,7 +40,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
         model,
         space,
         table,
-        law.Motion(
+        terms.Motion(
             q,
             np.zeros(7),
             osc.Twist(ZERO, ZERO),
@@ -51,7 +51,7 @@ def law_at(q: F64, *shapes: Shape, e: F64 = ZERO) -> law_module.Law:
             np.zeros(7),
             False,
             np.zeros(7),
-            law.nothing_ahead(arm),
+            terms.nothing_ahead(arm),
             np.zeros(0),
         ),
     )
@@ -141,7 +141,7 @@ def push_depends_on_the_gap_alone() -> bool:
         at = np.array([[radius + 0.04, 0.0, 0.0]])
         eye = np.eye(3).reshape(1, 3, 3)
         points = law.MovingPoints(at, eye, eye, np.zeros(1), np.ones(1, np.int64))
-        law.field_to(points, ZERO, ZERO, table, p, out, True, law.nothing_ahead(robot()).ends)
+        law.field_to(points, ZERO, ZERO, table, p, out, True, terms.nothing_ahead(robot()).ends)
         forces.append(out.tau[0])
     wanted = p.eta * (1.0 / 0.04 - 1.0 / p.rho0) / 0.04**2
     return bool(np.allclose(forces, wanted, rtol=1e-9))
@@ -181,9 +181,9 @@ def test_avoidance_goes_before_the_goal(monkeypatch: Patch):
 
     def in_the_null_space(*arguments: Any) -> Any:
         out, space, torques = true_law(*arguments), arguments[4], arguments[8].torques
-        projected = space.NT @ torques[law.OBSTACLES]
-        torques[law.KEEP] += projected - torques[law.OBSTACLES]
-        torques[law.OBSTACLES] = projected
+        projected = space.NT @ torques[terms.OBSTACLES]
+        torques[terms.KEEP] += projected - torques[terms.OBSTACLES]
+        torques[terms.OBSTACLES] = projected
         return out
 
     monkeypatch.setattr(servo_level, "law", in_the_null_space)

@@ -10,9 +10,10 @@ import pytest
 
 from rtctl.arm.bounds import SPEED_HORIZON
 from rtctl.arm.field import MovingPoints, move_points
-from rtctl.arm.law import Law, Motion, evaluate_law, nothing_ahead
+from rtctl.arm.law import evaluate_law
 from rtctl.arm.model import Model
 from rtctl.arm.osc import Twist, operational_space
+from rtctl.arm.terms import Law, Motion, nothing_ahead
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import Obstacles, obstacles_empty, with_shape
 from tests.arms import PANDA, PANDA_HOME, PANDA_JOINTS, Bullet, states

@@ -12,8 +12,9 @@ import pinocchio
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rtctl.arm.model import Model, RigidBody, spd_inverse
+from rtctl.arm.model import Model, spd_inverse
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.errors import ConfigError
 from rtctl.spec.urdf import package_folders
 from rtctl.types import F64

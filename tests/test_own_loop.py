@@ -13,7 +13,7 @@ import pytest
 from rtctl.arm import own_loop as module
 from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, RESIDUAL, TRAVEL
 from rtctl.arm.faults import BIT
-from rtctl.arm.memory import fresh, record_of
+from rtctl.arm.hot import fresh, record_of
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import Surroundings
 from rtctl.types import F64, Feedback, RecordRow, Severity, State

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio
 import pytest
 
-from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.design import kept
 from rtctl.design.points import coverage, given, place
 from rtctl.design.solids import solids_of

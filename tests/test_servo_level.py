@@ -7,7 +7,8 @@ import pytest
 
 from rtctl.arm import pipe, servo_level
 from rtctl.arm.flat import model_in, parameters_of
-from rtctl.arm.memory import HOT, Memory, record_of
+from rtctl.arm.hot import HOT, record_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.osc import operational_space
 from rtctl.arm.pipe import tick
 from rtctl.arm.task import selection

@@ -9,7 +9,8 @@ from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
 from firmware_sim.settings import load
 from rtctl import design
-from rtctl.design.arm import no_points, rigid_body
+from rtctl.arm.points import no_points
+from rtctl.design.arm import rigid_body
 from rtctl.design.report import report
 from rtctl.errors import ConfigError
 from tests.lab import PANDA, lab

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from rtctl.arm.field import Field
-from rtctl.arm.law import Cover, Motion, Outputs, WorkMemory, evaluate_law, law, outputs
+from rtctl.arm.law import evaluate_law, law
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace
 from rtctl.arm.robot import Robot
+from rtctl.arm.terms import Cover, Motion, Outputs, WorkMemory, outputs
 from rtctl.kernel import leaf_kernel
 from rtctl.types import Record
 from rtctl.world.primitives import Obstacles

@@ -15,12 +15,13 @@ import numpy as np
 from rtctl import design as cfg
 from rtctl.app.arm_link import link_spec
 from rtctl.arm import bounds, least_change, nearby, osc, scaling
-from rtctl.arm.law import Motion, nothing_ahead, prepared
+from rtctl.arm.law import prepared
 from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model
 from rtctl.arm.osc import OperationalSpace, Twist, operational_space
 from rtctl.arm.points import Points
 from rtctl.arm.robot import Robot
+from rtctl.arm.terms import Motion, nothing_ahead
 from rtctl.hal.can.link import LinkSpec
 from rtctl.hal.can.transport import Seqpacket
 from rtctl.protocol import e2e, frame, mit

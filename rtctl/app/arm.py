@@ -31,8 +31,9 @@ from rtctl.app.vehicle import (
 )
 from rtctl.arm import faults, task
 from rtctl.arm.gripper import ASKED, SEEN, TARGET, TAU, TORQUE, Gripper, Q, state_of
+from rtctl.arm.hot import places_of
 from rtctl.arm.limits import TorqueBounds, TorqueParts, limit_torque, slew_reference
-from rtctl.arm.memory import Memory, places_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.pipe import compile_part, initial, tick, warm
 from rtctl.arm.robot import Robot
 from rtctl.hal.can.transport import InProcess

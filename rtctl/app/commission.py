@@ -58,7 +58,8 @@ class Keys(NamedTuple):
 
 def geometry(config: Config, path: Path) -> Known:
     """Return axes and gravity of a config's arm; `path` is its file. Raises ConfigError."""
-    from rtctl.design.arm import no_points, rigid_body  # the rigid-body library takes its time
+    from rtctl.arm.points import no_points
+    from rtctl.design.arm import rigid_body  # the rigid-body library takes its time
 
     body = rigid_body(config, path)
     still, points = np.zeros(body.n), no_points()

@@ -15,7 +15,7 @@ import pinocchio as pin
 from scipy.signal import savgol_filter
 
 from rtctl.app.arm_log import rebuilt
-from rtctl.arm.model import UNLOADED, RigidBody
+from rtctl.arm.rigid_body import UNLOADED, RigidBody
 from rtctl.arm.robot import Robot
 from rtctl.errors import LogError
 from rtctl.log import schema

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm.kinematics import Chain, chain_of, clearance_of, postures_of, target_of
-from rtctl.arm.model import RigidBody
 from rtctl.arm.outlook import Around, Pace, rollout
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.robot import Robot
 from rtctl.design.solids import solids_of, surface
 from rtctl.kernel.rotations import R_of, exp3, quat_of

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rtctl.arm.field import ACCELERATION, FORCE, NORMAL, SUM, TASK, Field, FieldParams, own_field
-from rtctl.arm.memory import Memory, record_of
+from rtctl.arm.hot import record_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.point_inertia import times_inertia
 from rtctl.arm.robot import Robot
 from rtctl.arm.target import leads

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from rtctl.arm.model import RigidBody, spd_inverse
+from rtctl.arm.model import spd_inverse
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.task import selection, task_error
 from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64, Goal

@@ -3,7 +3,8 @@
 import numpy as np
 
 from rtctl.arm.flat import parameters_of
-from rtctl.arm.memory import Memory, record_of
+from rtctl.arm.hot import record_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.sensing import drives_torque
 from rtctl.types import Payload, Request

@@ -16,8 +16,8 @@ from rtctl.arm.estimator import joint_start, start
 from rtctl.arm.faults import FAULTS
 from rtctl.arm.flat import model_in, parameters_of, shapes_of, table_of
 from rtctl.arm.gripper import DRIVEN, gripped, refused, silent, unasked
-from rtctl.arm.law import KEEP
-from rtctl.arm.memory import MEASURED_POSTURE, Memory, fresh, record_of
+from rtctl.arm.hot import MEASURED_POSTURE, fresh, record_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.model import Model
 from rtctl.arm.payload import with_payload
 from rtctl.arm.record import record_dtype, with_grippers
@@ -44,6 +44,7 @@ from rtctl.arm.servo_level import (
 from rtctl.arm.supervision import hold_at, supervise, with_advice, with_goal
 from rtctl.arm.target import DIAGNOSE, START_SPEED_SCALE, WORDS, leads, pursues
 from rtctl.arm.task import between, point_of
+from rtctl.arm.terms import KEEP
 from rtctl.control.firas import rooms_of
 from rtctl.kernel import compile_for
 from rtctl.kernel.rotations import exp3, quat_of

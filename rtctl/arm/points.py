@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rtctl.types import F64, I64
 
 
@@ -21,3 +23,8 @@ class Coverage(NamedTuple):
     protrusion: float  # [m] farthest that the surface sticks out of the spheres; 0 when covered
     overhang: float  # [m] farthest that a sphere reaches beyond the geometry, an upper bound
     bare: tuple[str, ...]  # URDF links that have geometry but no full cover
+
+
+def no_points() -> Points:
+    """Return none."""
+    return Points(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), ())

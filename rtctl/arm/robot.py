@@ -8,9 +8,9 @@ from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
 from rtctl.arm.field import Field, FieldParams, LimitParams
 from rtctl.arm.gripper import Gripper
-from rtctl.arm.model import RigidBody
 from rtctl.arm.osc import MotionParams
 from rtctl.arm.points import Coverage, Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.self_collision import Own
 from rtctl.types import F64, I64, Record, Shape, Task
 from rtctl.world.meshes import NONE, Meshes

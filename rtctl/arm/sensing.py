@@ -2,7 +2,7 @@
 
     plausible feedback -> joint filter -> tip filter -> (model, when it is due) -> correction -> detection and latch
 
-m is the memory's record (`memory.HOT`) of this tick, c the robot's constants (`law.prepared`); both are written and
+m is the memory's record (`hot.HOT`) of this tick, c the robot's constants (`law.prepared`); both are written and
 read in place, as the fields of an object would be.
 """
 

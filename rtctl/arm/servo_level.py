@@ -3,7 +3,7 @@
     sensing -> (supervisor, when something happened) -> target -> law -> limiter -> progress -> record
 
 What is rare is left to Python: where it is wanted, the call ends with a flag, and `pipe` goes on with the next stage.
-The memory (`memory.HOT`) is copied once and written as the tick goes on; nobody but the caller sees the copy.
+The memory (`hot.HOT`) is copied once and written as the tick goes on; nobody but the caller sees the copy.
 """
 
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from rtctl.arm.escape import Phase
 from rtctl.arm.faults import ASTRAY, DISTRUST, STOPS
 from rtctl.arm.field import APART, APART_LED, Ends
 from rtctl.arm.flat import AGE, BODIES, GOAL_RHO, RHO, field_in, model_in, obstacles_in, row_of
+from rtctl.arm.hot import HOT, MEASURED_POSTURE
 from rtctl.arm.joint_field import LEAST_REACH
-from rtctl.arm.law import DRIVE, KEEP, LOAD, OBSTACLES, Ahead, Cover, Motion, WorkMemory, law, outputs
+from rtctl.arm.law import law
 from rtctl.arm.limits import TorqueBounds, TorqueParts, command_torque
 from rtctl.arm.loads import known_friction, loaded, observe, pushed
-from rtctl.arm.memory import HOT, MEASURED_POSTURE
 from rtctl.arm.model import Model, acceleration
 from rtctl.arm.osc import OperationalSpace, Twist
 from rtctl.arm.own_drive import let_drive
@@ -30,6 +30,7 @@ from rtctl.arm.sensing import Surroundings, correct, detect_faults, drives_torqu
 from rtctl.arm.stream import go_on, has_velocity
 from rtctl.arm.target import leads, limit_zones, parking_progress, progress_timers, pursues, target_of, wanted
 from rtctl.arm.task import point_along
+from rtctl.arm.terms import DRIVE, KEEP, LOAD, OBSTACLES, Ahead, Cover, Motion, WorkMemory, outputs
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import all_equal, any_set
 from rtctl.types import F64, U32, Drive, Feedback, RecordRow, Severity, State, Status, Task
@@ -346,7 +347,7 @@ def servo(
 ) -> tuple[F64, F64, U32, int]:
     """Run the servo level of one tick from a stage on, or until Python is needed.
 
-    before: the memory, see `memory.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.
+    before: the memory, see `hot.record_of`. parameters, table_before, shapes, bodies: see `flat`. asked: `asking`.
     ends: of the memory.
     Returns the memory, the table, the words of the tick's record, and flags: DONE | WORDS when it is over; MODEL:
     evaluate the model at the joints of the memory where its `evaluated` says so, and the task space, then go on at

@@ -5,7 +5,8 @@ import numpy as np
 from rtctl.arm import faults, stream, task
 from rtctl.arm.escape import Escape
 from rtctl.arm.faults import BIT
-from rtctl.arm.memory import MEASURED_POSTURE, Memory
+from rtctl.arm.hot import MEASURED_POSTURE
+from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.arm.servo_level import ENABLE_TIMEOUT, REST_HOLD, SETTLE, STOP_TIME
 from rtctl.control import goals, supervisor

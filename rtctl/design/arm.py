@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.disturbance import GRAVITY
 from rtctl.arm.encoders import SHARE
 from rtctl.arm.estimator import Design, EstimatorParams, JointParams
 from rtctl.arm.faults import SafetyParams
@@ -22,18 +21,18 @@ from rtctl.arm.field import (
 )
 from rtctl.arm.gripper import Gripper
 from rtctl.arm.law import prepared
-from rtctl.arm.model import NOTHING, Load, Model, RigidBody
 from rtctl.arm.osc import MotionParams
-from rtctl.arm.points import Coverage, Points
+from rtctl.arm.points import Coverage, Points, no_points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.robot import Robot, StopParams
 from rtctl.arm.self_collision import Own, nothing
 from rtctl.control.firas import rooms_of
 from rtctl.design import points as psp
 from rtctl.design.assets import Assets, load_assets, placed
-from rtctl.design.description import notes
+from rtctl.design.extremes import extremes, tool_of
 from rtctl.design.filters import SLOW, design, design_joint, lateness, tip_params
-from rtctl.design.mobility import mobility
 from rtctl.design.pairs import watched
+from rtctl.design.refusals import refuse_axes, refuse_contact, refuse_inertia, refuse_limits, refuse_torque
 from rtctl.errors import ConfigError
 from rtctl.kernel.rotations import R_of
 from rtctl.protocol import mit
@@ -44,9 +43,7 @@ from rtctl.spec.read import name_place
 from rtctl.spec.robot import Config, GripperTable
 from rtctl.spec.urdf import package_folders, urdf_file
 from rtctl.types import F64, Shape
-from rtctl.world.primitives import distance
 
-POSTURES = 256  # sampled for torque and inertia extremes
 NOTICEABLE = 0.002  # of the rating: an external torque that is less is what rounding of torques leaves
 PROMPT = 0.01  # [s] of servo and model period together: up to there, what a model is behind is less than that rounding
 FRICTION = 2.0  # times the torque that a drive may be wrong by: that much may hold a joint
@@ -54,19 +51,6 @@ VELOCITY_SHARE = 0.2  # of qd_max by which a joint's positions and its speed may
 OWN_RATE = 150.0  # [1/s] of the drives' own position loops at most: they turn at 10 kHz or more, the virtual ones at 2
 OWN_DAMPING = 1.4  # of those loops, twice the damping ratio
 P_BITS, V_BITS, T_BITS = 16, 12, 12  # of an MIT reply
-
-
-class Extremes(NamedTuple):
-    """Largest values over sampled postures within the joint limits, and those at home."""
-
-    gravity: F64  # (n,) [Nm] largest |g_i|, that of the tool included
-    gravity_home: F64  # (n,) [Nm] |g_i|
-    inertia: F64  # (n,) [kg m2] largest A_ii
-    inertia_home: F64  # (n,) [kg m2] A_ii
-    inertia_free: F64  # (n,) [kg m2] least 1 / (A^-1)_ii: of a joint while the others are free
-    tool: F64  # (n,) [Nm] largest torque of the tool's weight
-    payload: F64  # (n,) [Nm] largest |g_i| with payload_max_kg at the tip
-    payload_home: F64  # (n,) [Nm] the same at home
 
 
 def gripper_of(table: GripperTable) -> Gripper:
@@ -91,16 +75,16 @@ def build(config: Config, path: str | Path) -> Robot:
     """
     source, joints = str(path), config.robot.joints
     body = rigid_body(config, Path(path))
-    _refuse_inertia(config, Path(path))
-    _refuse_limits(config, body, source)
+    refuse_inertia(config, Path(path))
+    refuse_limits(config, body, source)
     home = np.array(config.robot.home_rad)
     found = extremes(config, body)
-    _refuse_torque(config, found, source)
-    _refuse_axes(config, body, source)
+    refuse_torque(config, found, source)
+    refuse_axes(config, body, source)
     points, coverage, own = _geometry(config, body, home, source)
     assets = load_assets(config.mesh, config.obstacle, Path(path))
     obstacles = tuple(loaded_shape(o, assets) for o in config.obstacle)
-    _refuse_contact(obstacles, assets, body, points, home, source)
+    refuse_contact(obstacles, assets, body, points, home, source)
     avoid = _obstacle_field(config, points, source)._replace(overhang=coverage.overhang)
     refuse_rooms(config.obstacle, rooms_of(avoid), source)
     rest = config.motion.posture.q_rest_rad
@@ -171,39 +155,6 @@ def build(config: Config, path: str | Path) -> Robot:
     return prepared(robot)
 
 
-def extremes(config: Config, body: RigidBody) -> Extremes:
-    """Return gravity torques and inertias over the same POSTURES every time: seeded, uniform within the limits."""
-    low = np.array([j.q_min_rad for j in config.robot.joints])
-    high = np.array([j.q_max_rad for j in config.robot.joints])
-    still, points = np.zeros(body.n), no_points()
-    samples = np.random.default_rng(0).uniform(low, high, (POSTURES, body.n))
-    models = [body.evaluate(q, still, points) for q in (np.array(config.robot.home_rad), *samples)]
-    g = np.abs([m.g for m in models])
-    A = np.array([np.diag(m.A) for m in models])
-    free = 1.0 / np.array([np.diag(m.A_inv) for m in models])
-    tool, payload = tool_of(config), config.robot.payload_max_kg
-    tools = np.array([weight(m, tool.mass, tool.com) for m in models])
-    loaded = np.array([np.abs(m.g + weight(m, payload, np.zeros(3))) for m in models])
-    most = g.max(axis=0), g[0], A.max(axis=0), A[0], free.min(axis=0)
-    return Extremes(*most, np.abs(tools).max(axis=0), loaded.max(axis=0), loaded[0])
-
-
-def weight(model: Model, mass: float, com: F64) -> F64:
-    """Return the torque (n,) [Nm] that carries a mass [kg] whose centre is at com (3,) [m] in the tip's frame."""
-    arm = model.R @ com
-    lifts = model.J[2] + model.J[3] * arm[1] - model.J[4] * arm[0]  # of the centre, along the world's z
-    return np.asarray(GRAVITY * mass * lifts)
-
-
-def tool_of(config: Config) -> Load:
-    """Return the tool of a config."""
-    tool = config.tool
-    if tool is None:
-        return NOTHING
-    xx, xy, xz, yy, yz, zz = tool.inertia_kg_m2 or (0.0,) * 6
-    return Load(tool.mass_kg, np.array(tool.com_m), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-
-
 def _behind(servo_hz: float, model_hz: float) -> float:
     """Return by how much more the torque of a load seems to be another because the model of a moving arm is old.
 
@@ -230,67 +181,6 @@ def rigid_body(config: Config, path: Path) -> RigidBody:
         else:
             key = "robot.tip_frame" if what == "tip_frame" else "robot.urdf"
         raise ConfigError(name_place(str(path), key), error.got, f"{error.wanted} ({urdf.name})") from None
-
-
-def _refuse_inertia(config: Config, path: Path) -> None:
-    """Refuse an inertia tensor that no body has where neither we nor a simulator can make anything of it."""
-    urdf = urdf_file(config.robot.urdf, path)
-    for note in notes(urdf, [j.name for j in config.robot.joints]):
-        if note.refused:
-            wanted = f"inertia tensors that bodies have; {note.text} ({urdf.name})"
-            raise ConfigError(name_place(str(path), "robot.urdf"), f"link {note.about}", wanted)
-
-
-def _refuse_limits(config: Config, body: RigidBody, source: str) -> None:
-    """Refuse joints that are given more range, speed or torque than the URDF states."""
-    limits = body.limits
-    for i, j in enumerate(config.robot.joints):
-        rows = [
-            ("q_min_rad", j.q_min_rad, j.q_min_rad >= limits.q_min[i] - 1e-6, f"at least {limits.q_min[i]:g}"),
-            ("q_max_rad", j.q_max_rad, j.q_max_rad <= limits.q_max[i] + 1e-6, f"at most {limits.q_max[i]:g}"),
-            (
-                "qd_max_rad_s",
-                j.qd_max_rad_s,
-                j.qd_max_rad_s <= limits.qd_max[i] * 1.000001,
-                f"at most {limits.qd_max[i]:g}",
-            ),
-            (
-                "tau_max_Nm",
-                j.tau_max_Nm,
-                j.tau_max_Nm <= limits.tau_max[i] * 1.000001,
-                f"at most {limits.tau_max[i]:g}",
-            ),
-        ]
-        for key, got, fine, wanted in rows:
-            if not fine:
-                place = name_place(source, f"robot.joints[{i}].{key}")
-                raise ConfigError(place, got, f"{wanted}, the URDF's limit of {j.name}")
-
-
-def _refuse_torque(config: Config, found: Extremes, source: str) -> None:
-    """Refuse a joint that cannot hold the arm at home with what may be sent, or anywhere with its rating.
-
-    What is named is the tool where the arm without it could be held, and the largest payload where it cannot at home.
-    """
-    for i, j in enumerate(config.robot.joints):
-        usable = config.safety.torque_ratio * j.tau_max_Nm
-        if config.tool is not None and found.tool[i] > 0.0:
-            for place, most, torque in (
-                ("at home", usable, found.gravity_home[i]),
-                ("", j.tau_max_Nm, found.gravity[i]),
-            ):
-                if torque >= most > torque - found.tool[i]:
-                    wanted = f"less: {j.name} would carry {torque:.3g} of {most:.3g} Nm {place or 'within the limits'}"
-                    raise ConfigError(name_place(source, "tool.mass_kg"), config.tool.mass_kg, wanted)
-        if found.payload_home[i] >= usable > found.gravity_home[i]:
-            wanted = f"less: {j.name} would carry {found.payload_home[i]:.3g} of {usable:.3g} Nm at home"
-            raise ConfigError(name_place(source, "robot.payload_max_kg"), config.robot.payload_max_kg, wanted)
-        place = name_place(source, f"robot.joints[{i}].tau_max_Nm")
-        if found.gravity_home[i] >= usable:
-            wanted = f"more than gravity's {found.gravity_home[i]:.3g} Nm at home / torque_ratio"
-            raise ConfigError(place, j.tau_max_Nm, wanted)
-        if found.gravity[i] >= j.tau_max_Nm:
-            raise ConfigError(place, j.tau_max_Nm, f"more than gravity's {found.gravity[i]:.3g} Nm within the limits")
 
 
 def _geometry(config: Config, body: RigidBody, home: F64, source: str) -> tuple[Points, Coverage, Own]:
@@ -323,19 +213,6 @@ def loaded_shape(obstacle: Obstacle, assets: Assets) -> Shape:
     return placed(shape, assets.clouds[obstacle.name]) if obstacle.name in assets.clouds else shape
 
 
-def _refuse_contact(
-    obstacles: tuple[Shape, ...], assets: Assets, body: RigidBody, points: Points, home: F64, source: str
-) -> None:
-    """Refuse an obstacle of the config that the arm touches at home."""
-    P = body.evaluate(home, np.zeros(body.n), points).P
-    for i, shape in enumerate(obstacles):
-        rho = distance(shape, P, assets.meshes)[0] - points.radius
-        if rho.min() <= 0.0:
-            place = name_place(source, f"obstacle[{i}].position_m")
-            got = f"{shape.name} {-rho.min():.3g} m inside the points of {points.names[int(rho.argmin())]} at home"
-            raise ConfigError(place, got, "an obstacle clear of the arm at home")
-
-
 def _reach(config: Config, body: RigidBody) -> float:
     """Return the sum [m] of the distances between neighbouring joints up to the tip: a bound that no posture passes."""
     model = body.model
@@ -347,17 +224,6 @@ def _reach(config: Config, body: RigidBody) -> float:
         total += float(np.linalg.norm(t - base if parent == 0 else t))
         joint = parent
     return total
-
-
-def _refuse_axes(c: Config, body: RigidBody, source: str) -> None:
-    """Raise ConfigError for an axis of the task along or about which the tip never moves."""
-    q_min, q_max = (np.array([getattr(j, key) for j in c.robot.joints]) for key in ("q_min_rad", "q_max_rad"))
-    never = mobility(body, q_min, q_max)
-    for i, axis in enumerate(c.motion.axes):
-        lost = never.unturned if axis.startswith("r") else never.still
-        if np.linalg.norm(lost[:, "xyz".index(axis[-1])]) > 1.0 - 1e-6:
-            place = name_place(source, f"motion.axes[{i}]")
-            raise ConfigError(place, axis, "an axis along (x) or about (rx) which this arm can move")
 
 
 def _motion(c: Config) -> MotionParams:
@@ -467,7 +333,3 @@ def _velocity_tolerance(c: Config) -> F64:
     qd_max = np.array([j.qd_max_rad_s for j in c.robot.joints])
     bound: F64 = VELOCITY_SHARE * qd_max + 2.0 * SHARE * noise
     return bound
-
-
-def no_points() -> Points:
-    return Points(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), ())

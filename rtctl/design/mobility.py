@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.types import F64
 
 POSTURES = 24  # sampled within the joint limits

@@ -5,7 +5,7 @@ from importlib.metadata import version
 import coal
 import numpy as np
 
-from rtctl.arm.model import RigidBody
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.self_collision import Hull, Own
 from rtctl.design import kept
 from rtctl.design.solids import solids_of

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rtctl.arm.model import RigidBody
 from rtctl.arm.points import Coverage, Points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.design import kept
 from rtctl.design.solids import EDGE, STEP, Solid, areas, depth, solids_of, surface
 from rtctl.errors import ConfigError

@@ -7,8 +7,8 @@ import numpy as np
 
 from rtctl.arm.robot import Robot
 from rtctl.control.firas import FieldParams
-from rtctl.design.arm import Extremes, extremes
 from rtctl.design.description import dynamics, notes
+from rtctl.design.extremes import Extremes, extremes
 from rtctl.plain import Json
 from rtctl.spec import rules
 from rtctl.spec.bus import LOAD_MAX

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import coal
 import numpy as np
 
-from rtctl.arm.model import RigidBody
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.design import kept
 from rtctl.errors import ConfigError
 from rtctl.types import F64, I64

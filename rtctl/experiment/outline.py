@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import ConvexHull
 
-from rtctl.arm.model import RigidBody
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.design.solids import solids_of
 from rtctl.types import F64
 from rtctl.world.outline import Projection, axis_view, outline, view

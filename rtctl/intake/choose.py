@@ -6,9 +6,9 @@ from typing import NamedTuple
 import coal
 import numpy as np
 
-from rtctl.arm.model import RigidBody
+from rtctl.arm.points import no_points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.arm.self_collision import Own
-from rtctl.design.arm import no_points
 from rtctl.design.pairs import hulls_of
 from rtctl.types import F64
 

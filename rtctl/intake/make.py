@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from rtctl.arm.model import RigidBody
-from rtctl.design.arm import no_points
+from rtctl.arm.points import no_points
+from rtctl.arm.rigid_body import RigidBody
 from rtctl.errors import ConfigError
 from rtctl.intake import drives as drive_table
 from rtctl.intake import text, urdf

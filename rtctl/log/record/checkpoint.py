@@ -15,7 +15,8 @@ import numpy as np
 
 from rtctl.arm.escape import DIRECTIONS, Phase
 from rtctl.arm.flat import shapes_of
-from rtctl.arm.memory import HOT, Memory, record_of
+from rtctl.arm.hot import HOT, record_of
+from rtctl.arm.memory import Memory
 from rtctl.arm.robot import Robot
 from rtctl.plain import Json
 from rtctl.types import Array, Severity, State, Status, Task
