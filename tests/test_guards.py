@@ -35,6 +35,7 @@ from tests.lab import robot, sphere
 from tests.test_law import ZERO, model_at
 
 FREE = np.full(7, np.inf)
+EYE = np.eye(3)
 NO_ENDS = np.zeros(0)  # no posture of a goal
 
 
@@ -199,19 +200,25 @@ def test_the_tip_is_not_pushed_past_its_speed(tau: F64, direction: list[float], 
         assert v < 0.05 or v + before * SPEED_HORIZON <= 0.5 + 1e-9
 
 
-def pushed_about(push: Callable[[F64], F64], v: F64, step: float) -> float:
-    """Return the top speed [m/s] of a kilogram pushed about, its force [N] slewed by `step` a period of 1 ms."""
-    eye, low, sent, top = np.eye(3), np.full(3, -1e6), np.zeros(3), 0.0
+def steady(force: F64) -> Callable[[F64], F64]:
+    return lambda _: force
+
+
+def pushed_about(push: Callable[[F64], F64], v: F64, step: float, A: F64 = EYE) -> float:
+    """Return the top speed [m/s] of a tip of inertia A pushed about, its force [N] slewed by `step` in each 1 ms."""
+    A_inv: F64 = np.asarray(np.linalg.inv(A), np.float64)
+    low, sent, top = np.full(3, -1e6), np.zeros(3), 0.0
     for _ in range(2000):
         rows, most = np.zeros((2, 3)), np.zeros(2)
-        tip_bounds(TipMotion(np.eye(6)[:, :3], np.zeros(6), v, sent), eye, eye, 0.5, np.full(3, 1e3 * step), rows, most)
+        tip = TipMotion(np.eye(6)[:, :3], np.zeros(6), v, A_inv @ sent)
+        tip_bounds(tip, A, A_inv, 0.5, np.full(3, 1e3 * step), rows, most)
         wanted = push(v)
         for _ in range(2):  # what the guards let pass, then what the limiter leaves of it
-            wanted = wanted + guard(eye, eye, wanted, low, -low, rows, most)[0]
+            wanted = wanted + guard(A, A_inv, wanted, low, -low, rows, most)[0]
             change = wanted - sent
             wanted = sent + change * min(1.0, step / max(float(np.abs(change).max()), 1e-12))  # all as one
         sent = wanted
-        v = v + 1e-3 * sent
+        v = v + 1e-3 * A_inv @ sent
         top = max(top, float(np.linalg.norm(v)))
     return top
 
@@ -233,6 +240,28 @@ def test_a_tip_that_is_pushed_aside_all_along_keeps_its_speed(step: float):
 def test_a_tip_that_is_turned_round_keeps_its_speed(step: float):
     """What brakes it hard would throw it back."""
     assert pushed_about(lambda _: np.array([-1000.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0]), step) <= 1.02 * 0.5
+
+
+@pytest.mark.parametrize("heavy", [3.0, 10.0, 30.0, 100.0])
+@pytest.mark.parametrize("strength", [100.0, 300.0, 1000.0])
+def test_a_tip_whose_joints_are_coupled_keeps_its_speed(heavy: float, strength: float):
+    """One joint has the most torque to give back; slewed as one with it, the others follow at its pace."""
+    rng = np.random.default_rng(3)
+    for _ in range(4):
+        Q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        force = rng.normal(size=3)
+        force *= strength / np.linalg.norm(force)
+        A = Q @ np.diag([1.0, 1.0, heavy]) @ Q.T
+        assert pushed_about(steady(force), np.array([0.45, 0.0, 0.0]), 1.0, A) <= 1.02 * 0.5
+
+
+def test_a_tip_at_rest_is_not_given_a_push_that_cannot_be_taken_back():
+    """As one that brakes hold: no speed yet, but the torque to have it."""
+    rows, most = np.zeros((2, 3)), np.zeros(2)
+    for push, kept in ((10.0, True), (60.0, False)):  # at 1000 N/s: 0.05 m/s until it is taken back, 1.8 m/s
+        tip = TipMotion(np.eye(6)[:, :3], np.zeros(6), np.zeros(3), np.array([push, 0.0, 0.0]))
+        tip_bounds(tip, np.eye(3), np.eye(3), 0.5, np.full(3, 1000.0), rows, most)
+        assert bool((rows @ tip.qdd <= most).all()) == kept
 
 
 def test_a_tip_that_brakes_gently_is_not_touched():

@@ -13,6 +13,7 @@ from tools.stress.play import CONFIGS, play, robot_of
     ("name", "seed", "number"),
     [
         pytest.param("planar4", 61201, 51, id="pushed aside at full torque, which is slewed"),
+        pytest.param("planar4", 71202, 69, id="let go by brakes beside what pushes it"),
         pytest.param("puma560", 61201, 53, id="friction that slows a joint makes the tip faster"),
         pytest.param("puma560", 61202, 71, id="the same, from a stretched arm"),
     ],
@@ -24,4 +25,4 @@ def test_the_tip_is_no_faster_than_v_max(name: str, seed: int, number: int):
     seen = play(table, number, path)
     assert seen.contact is None
     assert seen.arrived
-    assert 0.9 < seen.tip_speed < 1.0 + TIP_TOLERANCE
+    assert 0.9 < seen.tip_speed < 1.0 + 0.5 * TIP_TOLERANCE

@@ -269,6 +269,9 @@ def act(
     ahead = _ahead(arm, m, around.obstacles, ends, n)
     moves = m.state == _RUN or m.state == _STOPPING
     sent = m.sent[0, :n].copy() if moves else np.zeros(0)
+    qdd = m.qdd[:n].copy()
+    if m.state == _ARMED:  # what the arm will do when brakes that hold it open
+        qdd = acceleration(at.A_inv, m.sent[0, :n].copy(), at.h, at.g, np.zeros(n), qd)
     _, m.limit_flags = law(
         arm.constants,
         Cover(arm.radius, arm.link),
@@ -284,7 +287,7 @@ def act(
             Twist(m.v_ref.copy(), m.w_ref.copy()),
             q_rest,
             m.speed_scale,
-            m.qdd[:n].copy(),
+            qdd,
             m.floating != 0 or m.driven != 0,
             hand,
             ahead,
