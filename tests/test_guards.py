@@ -272,13 +272,13 @@ def test_a_tip_that_brakes_gently_is_not_touched():
         assert (rows @ tip.qdd < most).all()
 
 
-def beside_wall(x: float, v: float) -> tuple[MovingPoints, Field]:
-    """Return a point of a kilogram at x [m] that moves at v [m/s] before a wall at 0, and what the field measures."""
+def beside_wall(x: F64, v: F64, mobility: F64 = EYE) -> tuple[MovingPoints, Field]:
+    """Return a point at x (3,) [m] that moves at v (3,) [m/s] before the wall x = 0, and what the field measures."""
     upright = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
     wall = with_shape(obstacles_empty(2), 0, Shape("wall", "plane", np.zeros(4), ZERO, upright, ZERO, ZERO))
-    point = MovingPoints(np.array([[x, 0.0, 0.0]]), np.eye(3)[None], np.eye(3)[None], np.zeros(1), np.ones(1, np.int64))
+    point = MovingPoints(x[None].copy(), np.eye(3)[None], mobility[None].copy(), np.zeros(1), np.ones(1, np.int64))
     seen = field_buffers(2, 1, 3)
-    field(point, ZERO, np.array([v, 0.0, 0.0]), wall, field_params(0.5, 0.1, 0.02, 1e-3, 0.7, 0.0, 50.0), seen, True)
+    field(point, ZERO, v, wall, field_params(0.5, 0.1, 0.02, 1e-3, 0.7, 0.0, 50.0), seen, True)
     return point, seen
 
 
@@ -289,7 +289,7 @@ def test_nothing_is_pulled_into_what_is_near(pull: float):
     x, v, sent, least = 0.049, -0.5, 0.0, np.inf
     for _ in range(1500):
         qd = np.array([v, 0.0, 0.0])
-        near = nearby_of(*beside_wall(x, v), qd, 0.5, 5.0, rate)
+        near = nearby_of(*beside_wall(np.array([x, 0.0, 0.0]), qd), qd, 0.5, 5.0, rate)
         tau, low = np.array([-pull, 0.0, 0.0]), np.full(3, -1e6)
         asked = sent_of(Inertia(eye, eye), Motors(ZERO, FREE[:3]), tau, bounds_of(low, -low), near)[0][0]
         v, x = v + 1e-3 * sent, x + 1e-3 * v
@@ -297,6 +297,33 @@ def test_nothing_is_pulled_into_what_is_near(pull: float):
         least = min(least, x)
     assert 0.0 < least < 0.01
     assert abs(v) < 0.01
+
+
+@pytest.mark.parametrize("heavy", [1.0, 10.0])
+@pytest.mark.parametrize("pull", [100.0, 1000.0])
+def test_nothing_is_pulled_into_what_is_near_by_joints_slewed_as_one(heavy: float, pull: float):
+    """What pulls it along the wall takes nearly all of the slew; what stops it comes first all the same."""
+    rng, rate, low = np.random.default_rng(5), np.full(3, 2000.0), np.full(3, -1e6)
+    for _ in range(3):
+        Q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        A = Q @ np.diag([1.0, 1.0, heavy]) @ Q.T
+        A_inv, force = np.ascontiguousarray(np.linalg.inv(A)), rng.normal(size=3)
+        force *= pull / np.linalg.norm(force)
+        force[0] = -abs(force[0])
+        x, v, sent = np.array([0.049, 0.0, 0.0]), np.array([-0.3, 0.0, 0.0]), np.zeros(3)
+        for _ in range(1000):
+            if v[0] > 0.0:  # turned away
+                break
+            point, seen = beside_wall(x, v, A_inv)
+            tau = force + seen.tau
+            for _ in range(2):  # what the guards let pass, then what the limiter leaves of it
+                near = nearby_of(point, seen, v, 0.5, 5.0, rate)
+                inertia, motors = Inertia(A, A_inv), Motors(ZERO, FREE[:3])
+                change = sent_of(inertia, motors, tau, bounds_of(low, -low), near, A_inv @ sent)[0] - sent
+                tau = sent + change * min(1.0, 2.0 / max(float(np.abs(change).max()), 1e-12))
+            v = v + 1e-3 * A_inv @ sent
+            x, sent = x + 1e-3 * v, tau
+            assert x[0] > 0.002
 
 
 def crowd(seed: int, slots: int = 24) -> tuple[Model, MovingPoints, Field, F64, F64]:
