@@ -140,20 +140,14 @@ def slew_time(A: F64, qdd: F64, tau_rate: F64) -> float:
 
 
 @leaf_kernel
-def _kept(gap: float, slews: float, bound: float) -> float:
-    """Return a bound [m/s2] by which no more than the gap [m/s] comes on while torque is slewed to none: slews [s]."""
-    return min(bound, 2.0 * gap / slews) if gap > 0.0 and slews > 0.0 else bound
-
-
-@leaf_kernel
 def tip_bounds(tip: TipMotion, A: F64, A_inv: F64, v_max: float, tau_rate: F64, rows: F64, most: F64) -> None:
     """Write the TIP_ROWS first rows and bounds of row qdd that keep the tip's speed below v_max [m/s].
 
     Along its velocity v, and along p = v + a T/2, what that comes to when its acceleration a is taken back from now on
     within T: at the jerk along its own way, or by joints that are slewed as one, whichever takes longer. An
     acceleration across a fast tip's way, or one that turns it round, makes it no faster now, and is too large to be
-    taken back by the time it does. So is one of a tip at rest that brakes let go. Neither bound is more than what comes
-    to v_max while all joints are slewed, 2 (v_max - v)/T.
+    taken back by the time it does. So is one of a tip at rest that brakes let go. The latter bound is no more than what
+    comes to v_max while all joints are slewed, 2 (v_max - v)/T.
 
     The motion task never asks for more than v_max; a field that shoves the arm may. inf while the tip is slow
     and stays so.
@@ -175,12 +169,15 @@ def tip_bounds(tip: TipMotion, A: F64, A_inv: F64, v_max: float, tau_rate: F64, 
             _tip_along(tip, x, y, z, rows, 1)
             drift = (tip.Jdqd[0] * x + tip.Jdqd[1] * y + tip.Jdqd[2] * z) / peak
             jerk = jerk_along(rows, 1, mobility(A_inv, rows, 1), tau_rate)
-            most[1] = _kept(v_max - along / peak, slews, acceleration_bound(v_max, along / peak, jerk)) - drift
+            most[1], gap = acceleration_bound(v_max, along / peak, jerk), v_max - along / peak
+            if gap > 0.0 and slews > 0.0:
+                most[1] = min(most[1], 2.0 * gap / slews)
+            most[1] -= drift
     if not slow:
         _tip_along(tip, v[0], v[1], v[2], rows, 0)
         drift = (tip.Jdqd[0] * v[0] + tip.Jdqd[1] * v[1] + tip.Jdqd[2] * v[2]) / speed
         jerk = jerk_along(rows, 0, mobility(A_inv, rows, 0), tau_rate)
-        most[0] = _kept(v_max - speed, slews, acceleration_bound(v_max, speed, jerk)) - drift
+        most[0] = acceleration_bound(v_max, speed, jerk) - drift
 
 
 @leaf_kernel
