@@ -372,19 +372,23 @@ void gather(const double *const *a, const double *s, const int64_t *link, int n,
         if (low[i] > 0) high[i] = std::max(high[i], low[i]);
         else if (high[i] < 0) low[i] = std::min(low[i], high[i]);
     }
-    double v[3], speed = std::sqrt(dot(a[XD], a[XD], 3)), accel = 0, along = 0, peak = 0;
+    double v[3], speed = std::sqrt(dot(a[XD], a[XD], 3)), accel = 0, along = 0, peak = 0, slews = 0;
+    bool slow = speed < s[TIP_SLOW] * s[V_MAX];
+    for (int i = 0; i < n; i++) slews = std::max(slews, std::fabs(dot(a[A] + i * n, a[QDD], n)) / a[TAU_RATE][i]);
     tip_most[0] = tip_most[1] = INFINITY;
     for (int c = 0; c < 3; c++) v[c] = a[JDQD][c] + dot(a[J] + c * n, a[QDD], n), accel += v[c] * v[c];
     if (accel > 0) {
-        double back = 0.5 * std::sqrt(accel) / std::max(tip_along(a, s, v, 1, n), 1e-9);
+        double back = 0.5 * std::max(std::sqrt(accel) / std::max(tip_along(a, s, v, 1, n), 1e-9), slews);
         for (int c = 0; c < 3; c++) v[c] = a[XD][c] + back * v[c], peak += v[c] * v[c], along += v[c] * a[XD][c];
         peak = std::sqrt(peak);
-        if (peak >= s[TIP_SLOW] * s[V_MAX] && along < s[ALIGNED] * peak * speed) {
-            double jerk = tip_along(a, s, v, 1, n);
-            tip_most[1] = may(s[V_MAX], along / peak, jerk, s) - dot(a[JDQD], v, 3) / peak;
+        if (peak >= s[TIP_SLOW] * s[V_MAX] && (slow || along < s[ALIGNED] * peak * speed)) {
+            double jerk = tip_along(a, s, v, 1, n), gap = s[V_MAX] - along / peak;
+            tip_most[1] = may(s[V_MAX], along / peak, jerk, s);
+            if (gap > 0 && slews > 0) tip_most[1] = std::min(tip_most[1], 2 * gap / slews);
+            tip_most[1] -= dot(a[JDQD], v, 3) / peak;
         }
     }
-    if (speed >= s[TIP_SLOW] * s[V_MAX]) {
+    if (!slow) {
         double jerk = tip_along(a, s, a[XD], 0, n);
         tip_most[0] = may(s[V_MAX], speed, jerk, s) - dot(a[JDQD], a[XD], 3) / speed;
     }
