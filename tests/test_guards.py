@@ -1,10 +1,9 @@
-"""The guards against their promises, and their search against another solver."""
+"""The guards against their promises, by what moves under them."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-import quadprog
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,64 +21,20 @@ from rtctl.arm.bounds import (
     tip_bounds,
 )
 from rtctl.arm.field import Field, MovingPoints, field, field_buffers, field_params
-from rtctl.arm.guards import Inertia, Motors, hold_back, let_pass
+from rtctl.arm.guards import Inertia, Motors
 from rtctl.arm.joint_field import own_field
-from rtctl.arm.least_change import SOFTNESS, rows_in, rows_sizes
 from rtctl.arm.model import Model
-from rtctl.arm.nearby import Nearby, look_near, nearby_in
 from rtctl.arm.scaling import scale_to_limits
 from rtctl.types import F64, Shape
 from rtctl.world.primitives import obstacles_empty, with_shape
 from tests.arms import PANDA_HOME, states
+from tests.guarding import bounds_of, guard, nearby_of, nearest, sent_of
 from tests.lab import robot, sphere
 from tests.test_law import ZERO, model_at
 
 FREE = np.full(7, np.inf)
 EYE = np.eye(3)
 NO_ENDS = np.zeros(0)  # no posture of a goal
-
-
-def bounds_of(low: F64, high: F64, rows: F64 | None = None, most: F64 | None = None) -> Bounds:
-    rows = np.zeros((0, len(low))) if rows is None else rows
-    return Bounds(low, high, rows, np.zeros(0) if most is None else most)
-
-
-def nearby_of(points: MovingPoints, seen: Field, qd: F64, share: float, braking: float, rate: F64) -> Nearby:
-    """Return the points within a share of the influence of obstacles, with their cheap bounds."""
-    room, m, n = len(seen.leader) * len(points.radius), len(points.radius), len(qd)
-    whole, real = np.zeros(3 * room + 1, np.int64), np.zeros(room + 4 * m + n + 1)
-    views = getattr(nearby_in, "py_func", nearby_in)  # a leaf kernel gives arrays to leaf kernels alone
-    whole[-1] = look_near(views(whole, real, points, seen, qd, braking, rate), share)
-    near: Nearby = views(whole, real, points, seen, qd, braking, rate)
-    return near
-
-
-def sent_of(
-    inertia: Inertia, motors: Motors, tau: F64, bounds: Bounds, near: Nearby, start: F64 | None = None
-) -> tuple[F64, bool]:
-    """Return what the guards let pass of tau (n,) [Nm], and whether any acts, as the law asks them."""
-    n, work = len(tau), np.zeros((2, len(tau)))
-    if let_pass(inertia, motors, tau, bounds, near, work):
-        return work[0], False
-    real, whole = rows_sizes(n)
-    rows = getattr(rows_in, "py_func", rows_in)(np.zeros(real), np.zeros(whole, np.int64), n)
-    rows.x[0] = 0.0 if start is None else start
-    acts = hold_back(rows, inertia, motors, tau, bounds, near, np.zeros(2 * n + len(bounds.most), np.int64), work)
-    return work[0], acts
-
-
-def guard(
-    A: F64, A_inv: F64, tau: F64, low: F64, high: F64, rows: F64, most: F64, start: F64 | None = None
-) -> tuple[F64, bool]:
-    """Return what the guards add (n,) [Nm] to a torque that the motors always have, and whether they act."""
-    n = len(tau)
-    nothing = MovingPoints(
-        np.zeros((0, 3)), np.zeros((0, 3, n)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, np.int64)
-    )
-    near = nearby_of(nothing, field_buffers(0, 0, n), np.zeros(n), 0.5, 5.0, np.ones(n))
-    motors = Motors(np.zeros(n), np.full(n, np.inf))
-    out, acts = sent_of(Inertia(A, A_inv), motors, tau, bounds_of(low, high, rows, most), near, start)
-    return out - tau, acts
 
 
 MIN, MAX, FASTEST, BRAKING = np.full(7, -2.0), np.full(7, 2.0), np.full(7, 2.0), np.full(7, 10.0)
@@ -109,43 +64,6 @@ def test_no_joint_is_accelerated_to_where_it_could_not_stop(tau: F64, q: list[fl
     assert (soon <= bound_up + 1e-9).all()
     assert (soon >= -bound_down - 1e-9).all()
     assert acts or (soon == moving + joints_guarded(tau, at, moving)[0] * SPEED_HORIZON).all()
-
-
-def nearest(A: F64, wanted: F64, C: F64, b: F64) -> F64:
-    """Return argmin (x - w)^T A (x - w)/2 + sum s^2/(2 softness c A^-1 c^T) with C x - s <= b, by another solver."""
-    n, r = C.shape[1], len(b)
-    size = np.einsum("ci,ij,cj->c", C, np.linalg.inv(A), C)
-    G = np.zeros((n + r, n + r))
-    G[:n, :n], G[n:, n:] = A, np.diag(1.0 / (SOFTNESS * size))
-    scale = 1.0 / np.sqrt(np.diag(G))  # or its own test for singular matrices refuses
-    found = quadprog.solve_qp(
-        G * scale * scale[:, None],
-        scale * np.append(A @ wanted, np.zeros(r)),
-        (np.hstack((-C, np.eye(r))) * scale).T,
-        -b,
-    )[0]
-    x: F64 = scale[:n] * found[:n]
-    return x
-
-
-@given(seed=st.integers(0, 1 << 32), rows=st.integers(0, 40), contradicting=st.booleans(), start=st.booleans())
-def test_what_the_guards_change_is_the_least_that_keeps_every_bound(
-    seed: int, rows: int, contradicting: bool, start: bool
-):
-    """Against quadprog, on bounds that can all be kept and on those that cannot."""
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(1, 9))
-    M = rng.normal(size=(n, n))
-    A = M @ M.T + 0.1 * np.eye(n)
-    A_inv, wanted = np.linalg.inv(A), rng.normal(0.0, 20.0, n)
-    C, feasible = rng.normal(size=(rows, n)), rng.normal(size=n)
-    b = C @ feasible + rng.uniform(-3.0 if contradicting else 0.0, 3.0, rows)
-    low, high = feasible - rng.uniform(0.1, 20.0, n), feasible + rng.uniform(0.1, 20.0, n)
-    added, acts = guard(A, A_inv, A @ wanted, low, high, C, b, rng.normal(size=n) if start else None)
-    found = wanted + A_inv @ added
-    best = nearest(A, wanted, np.vstack((np.eye(n), -np.eye(n), C)), np.concatenate((high, -low, b)))
-    np.testing.assert_allclose(found, np.clip(best, low, high), atol=1e-5 * (1.0 + np.abs(best).max()))
-    assert acts == bool((wanted > high).any() or (wanted < low).any() or (C @ wanted > b).any())
 
 
 def test_a_push_away_stays_one_when_a_joint_is_at_its_stop():
@@ -412,18 +330,3 @@ def test_two_links_that_close_fast_are_neither_thrown_back_nor_brought_to_touch(
         least, back = min(least, x), max(back, v)
     assert least > 0.5 * params.rho_min
     assert back < 0.25  # half of what it came with
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_start_that_is_not_a_number_changes_nothing(value: float):
-    rng = np.random.default_rng(3)
-    model, tau, rows, low = (
-        model_at(PANDA_HOME, np.zeros(7)),
-        rng.normal(0.0, 20.0, 7),
-        rng.normal(size=(3, 7)),
-        np.full(7, -5.0),
-    )
-    from_rest = guard(model.A, model.A_inv, tau, low, -low, rows, np.ones(3))
-    from_there = guard(model.A, model.A_inv, tau, low, -low, rows, np.ones(3), np.full(7, value))
-    assert from_there[0].tobytes() == from_rest[0].tobytes()
-    assert from_rest[1]

@@ -34,6 +34,11 @@ class Target(NamedTuple):
 
 
 TARGETS = (
+    Target("rtctl/arm/bounds.py", ("test_guards_alone",), False),
+    Target("rtctl/arm/guards.py", ("test_guards_alone",), False),
+    Target("rtctl/arm/least_change.py", ("test_guards_alone",), False),
+    Target("rtctl/arm/nearby.py", ("test_guards_alone",), False),
+    Target("rtctl/arm/scaling.py", ("test_guards_alone",), False),
     Target("rtctl/arm/limits.py", ("test_arm_limits",), False),
     Target("rtctl/arm/faults.py", ("test_faults_alone",), False),
     Target("rtctl/arm/own_loop.py", ("test_own_loop",), False),
