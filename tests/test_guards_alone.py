@@ -89,9 +89,9 @@ def test_joints_keep_what_they_can_brake_with_the_torque_rate_of_all(seed: int):
     if seed % 3 == 0:
         A = np.diag(np.diag(A))  # joints that do not act on each other
     q, qd = rng.uniform(-1.1, 1.1, n), rng.uniform(-2.5, 2.5, n)
-    limits = MotionLimits(
-        -rng.uniform(0.5, 1.0, n), rng.uniform(0.5, 1.0, n), *rng.uniform(1.0, 3.0, (3, n)), rng.uniform(10.0, 1e3, n)
-    )
+    low, high = -rng.uniform(0.5, 1.0, n), rng.uniform(0.5, 1.0, n)
+    qd_max, braking, tau_max = rng.uniform(1.0, 3.0, (3, n))
+    limits = MotionLimits(low, high, qd_max, braking, tau_max, rng.uniform(10.0, 1e3, n))
     low, high = np.empty(n), np.empty(n)
     with np.errstate(invalid="ignore"):  # no share of a joint times a jerk without bound, where the interpreter runs it
         joint_bounds(A, q, qd, limits, low, high)
