@@ -50,6 +50,7 @@ DEMANDED = {
     "collision": (Severity.SS2, "R"),
     "collision_hard": (Severity.SS1, "R"),
     "goal_stale": (Severity.SS2, "A"),
+    "error_passive_long": (Severity.SS2, "A"),
 }
 
 
@@ -196,6 +197,9 @@ CASES = {
     "collision": Case(pushed(15.0), pushed(3.0), alone=True),
     "collision_hard": Case(pushed(40.0), alone=True),
     "goal_stale": Case(streamed(101), streamed(100)),
+    "error_passive_long": Case(
+        said(*[{"link": int(Link.ERROR_PASSIVE)}] * 1000), said(*[{"link": int(Link.ERROR_PASSIVE)}] * 999)
+    ),
 }
 
 

@@ -91,6 +91,7 @@ BY_COUNT: list[tuple[str, dict[str, int], dict[str, int]]] = [
     ("encoder_jump", {"jumps": 0b101}, {"jumps": 0b100}),
     ("deadline", {"missed": 3}, {"missed": 2}),
     ("innovation", {"innovation": 5}, {"innovation": 4}),
+    ("error_passive_long", {"passive": 1000}, {"passive": 999}),
 ]
 BY_FLAG = {
     Link.DUPLICATE: "duplicate_reply",
@@ -142,6 +143,7 @@ RUNS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [  # counter, what adds
     ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "active": False}),
     ("slew_follows_echo", {"slew_follows_echo": True}, {"slew_follows_echo": True, "link": int(Link.DERATED)}),
     ("missed", {"missed": 1}, {}),
+    ("passive", {"link": int(Link.ERROR_PASSIVE)}, {}),
     ("innovation", {"innovation": 8.1}, {"innovation": 8.0}),
     ("innovation", {"innovation": np.nan}, {"innovation": np.nan, "active": False}),
 ]
@@ -227,6 +229,7 @@ log_degraded      51  LOG A
 collision         24  SS2 R
 collision_hard    24  SS1 R
 goal_stale        47  SS2 A
+error_passive_long 10 SS2 A
 """
 
 

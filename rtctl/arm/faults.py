@@ -14,6 +14,7 @@ from rtctl.kernel import kernel
 from rtctl.types import B1, F64, I64, Feedback, Link, Severity, State
 
 JUMP_WINDOW = 50  # cycles in which a second jump makes a fault of a glitch
+PASSIVE_TIME = 1.0  # [s] for which the arm moves on with a controller that is error-passive
 
 FAULT_CODES = {
     0x8: "over-voltage",
@@ -87,6 +88,7 @@ FAULTS = (
     Fault("collision", 24, Severity.SS2, "R", "something pushes the arm that nobody told of"),
     Fault("collision_hard", 24, Severity.SS1, "R", "something struck the arm"),
     Fault("goal_stale", 47, Severity.SS2, "A", "no goal of a stream came within the time-out of the last"),
+    Fault("error_passive_long", 10, Severity.SS2, "A", "the controller has been error-passive for a second"),
 )
 TABLE = FaultTable.of(FAULTS)
 BIT, names, severity = TABLE.bit, TABLE.names, TABLE.severity
@@ -101,10 +103,11 @@ DISTRUST = sum(  # bits of the faults after which a torque that follows from the
 )
 ASTRAY = DISTRUST | BIT["contact"] | BIT["outside_limits"]  # while it stops: it does not go as it should
 _DISABLED, _TORQUE, _FAULT, _JUMPS = detection.DISABLED, detection.TORQUE, detection.FAULT, (1 << JUMP_WINDOW) - 1
-_CORRUPT, _SEND_FAILED, _DERATED = (
+_CORRUPT, _SEND_FAILED, _DERATED, _PASSIVE = (
     int(Link.CORRUPT),
     int(Link.SEND_FAILED),
     int(Link.DERATED),
+    int(Link.ERROR_PASSIVE),
 )  # plain integers: a flag's & is slow
 _BY_LINK = tuple(
     (int(flag), BIT[name])
@@ -145,6 +148,7 @@ class _Bits(NamedTuple):
     collision: int = BIT["collision"]
     collision_hard: int = BIT["collision_hard"]
     goal_stale: int = BIT["goal_stale"]
+    error_passive_long: int = BIT["error_passive_long"]
 
 
 _B = _Bits()
@@ -201,6 +205,7 @@ class Counters(NamedTuple):
     jumps: int = 0  # last JUMP_WINDOW cycles, one bit each
     missed: int = 0
     innovation: int = 0
+    passive: int = 0
 
 
 @kernel
@@ -250,6 +255,7 @@ def counted(link: int, e: Evidence, c: Counters, innovation_max: float) -> Count
         ((c.jumps << 1) | (1 if e.implausible else 0)) & _JUMPS if active else 0,
         _grown(c.missed, e.missed != 0),
         _grown(c.innovation, active and not e.innovation <= innovation_max),
+        _grown(c.passive, link & _PASSIVE != 0),
     )
 
 
@@ -299,6 +305,8 @@ def detect(link: int, e: Evidence, n: Counters, p: Bounds, dt: float) -> int:
         bits |= _B.innovation
     if active and flags & (detection.TOUCHED | detection.STRUCK):
         bits |= _B.collision_hard if flags & detection.STRUCK else _B.collision
+    if n.passive * dt > PASSIVE_TIME - half:
+        bits |= _B.error_passive_long
     for flag, bit in _BY_LINK:
         if link & flag:
             bits |= bit

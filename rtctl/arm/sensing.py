@@ -279,10 +279,10 @@ def detect_faults(
         m.innovation,
     )
     k, surprising = m.counters, c.safety_innovation_max * _surprise(c, m, model)
-    counters = counted(f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]), surprising)
+    counters = counted(f.link, evidence, Counters(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7], k[8]), surprising)
     bounds = Bounds(c.safety_stale_periods, c.safety_lost_periods, c.safety_feed_timeout)
     m.present = detect(f.link, evidence, counters, bounds, c.dt)
-    for i in range(8):
+    for i in range(9):
         k[i] = counters[i]
     m.in_force, m.good[:_FAULTS] = latch_with(m.present, m.in_force, m.good[:_FAULTS].copy(), AUTOMATIC)
     m.q_previous[:n], m.age_previous[:n], m.encoder_monitors[:, :n] = f.q, f.age, monitors
