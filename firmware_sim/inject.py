@@ -29,7 +29,11 @@ KINDS = {
     "encoder_jump": "the encoder is off by 0.5 rad",
     "push": "something pushes a link of the arm: link, newton, direction in the world",
     "reboot": "the drive loses its supply for a moment: registers from flash, disabled",
+    "foreign": "somebody else tells the drive to give no torque, after each command",
+    "error_passive": "the controller's CAN interface is error-passive",
+    "bus_off": "the controller's CAN interface is off the bus: it sends nothing and hears nothing",
 }
+INTERFACE = ("bus_off", "error_passive")  # what befalls the controller's interface, whichever the joint
 FOREVER = 1 << 62
 JUMP = 0.5  # [rad]
 ONCE = frozenset(("drive_fault", "weak", "reboot"))  # done at its time, and over
@@ -152,6 +156,11 @@ class Injector:
         if self.active("corrupt_crc", now, joint):
             data = self._flipped(data)
         return [data, data] if self.active("duplicate", now, joint) else [data]
+
+    def interface(self, now: int) -> str:
+        """Return which of INTERFACE holds at time `now` [ns], the worst; "" for none."""
+        held = (k for k in INTERFACE if any(f.kind == k and f.start <= now < f.end for f in self.faults))
+        return next(held, "")
 
     def _flipped(self, data: bytes) -> bytes:
         bit = self.random.randrange(len(data) * 8)

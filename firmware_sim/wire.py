@@ -18,6 +18,13 @@ from firmware_sim.inject import Injector
 from firmware_sim.traffic import SILENT, Traffic
 from rtctl.protocol import frame
 
+NO_TORQUE = bytes.fromhex("7fff7ff0000007ff")  # of the MIT mode: no gains, the middle of every range
+TOLD = {  # error frames of Linux by which an interface says what it has become: identifier, data[1]
+    "bus_off": (frame.ERR_BUSOFF, 0),
+    "error_passive": (frame.ERR_CRTL, 0x10),  # too many errors in what it received
+    "": (frame.ERR_CRTL | frame.ERR_RESTARTED, 0x40),  # error-active again
+}
+
 
 class Wire:
     """Routes frames by their identifier; owns nothing."""
@@ -30,6 +37,7 @@ class Wire:
         self.bank, self.injector, self.fd, self.traffic = bank, injector, fd, traffic
         self.drives = bank.drives
         self.by_id = {d.rating.motor: k for k, d in enumerate(self.drives)}
+        self.interface = ""  # of inject.INTERFACE, what the controller's was told to be
 
     def answer(self, now: int, came: Batch, replies: Batch, first: int, clocked: bool) -> tuple[int, int]:
         """Take the frames of a batch from `first` on, each answered at once; add the replies to another batch.
@@ -37,7 +45,7 @@ class Wire:
         now: [ns] on the scenario's clock. clocked: stop before a second frame to a drive within a period (AGAIN), and
         once every drive has had one (EVERYBODY). Returns the next frame, and why it stopped there: else ALL_READ.
         """
-        at, quiet = first, self.traffic.quiet and self.injector.quiet(now)
+        at, quiet = first, self.traffic.quiet and self.injector.quiet(now) and not self.interface
         while at < came.count:
             end = self._own(came, at)
             if quiet and at < end:
@@ -71,7 +79,16 @@ class Wire:
         return k >= 0 and bool(self.bank.i[k, COMMANDED]) and not (f.error or f.rtr or f.extended)
 
     def answer_one(self, now: int, raw: bytes) -> list[bytes]:
-        """Take one frame; return the replies to it."""
+        """Take one frame; return the replies to it, after what the controller's interface says of itself."""
+        before, self.interface = self.interface, self.injector.interface(now)
+        said = [] if self.interface == before else [self._told(self.interface)]
+        return said if self.interface == "bus_off" else said + self._answered(now, raw)
+
+    def _told(self, state: str) -> bytes:
+        can_id, detail = TOLD[state]
+        return frame.pack(can_id, bytes((0, detail)) + bytes(6), fd=self.fd, error=True)
+
+    def _answered(self, now: int, raw: bytes) -> list[bytes]:
         try:
             f = frame.unpack(raw)
         except ValueError:
@@ -87,7 +104,11 @@ class Wire:
             return []
         self.bank.i[k, COMMANDED] = 1
         data = self.injector.command(now, k, f.data)
-        return self._sent(now, k, self.drives[k].receive(data) if data is not None else None)
+        said = self._sent(now, k, self.drives[k].receive(data) if data is not None else None)
+        if self.injector.active("foreign", now, k):
+            said.append(frame.pack(f.can_id, NO_TORQUE, fd=self.fd, brs=self.fd))
+            said += self._sent(now, k, self.drives[k].receive(NO_TORQUE))
+        return said
 
     def _register(self, now: int, data: bytes) -> list[bytes]:
         motor = codec.decode_register(data).motor if len(data) >= 8 else -1

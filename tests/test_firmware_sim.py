@@ -21,7 +21,7 @@ from firmware_sim.__main__ import QUIET_S
 from firmware_sim.batch import Batch
 from firmware_sim.bus import Hub
 from firmware_sim.camera import Camera
-from firmware_sim.inject import KINDS, parse
+from firmware_sim.inject import INTERFACE, KINDS, parse
 from firmware_sim.settings import SettingsError
 from firmware_sim.simulator import Simulator, open_simulator
 from rtctl.app.vehicle import LOCKSTEP_WAIT
@@ -324,7 +324,7 @@ def play(text: str, periods: int = 80) -> tuple[Simulator, list[list[bytes]], Co
 def test_every_fault_kind_is_playable_and_leaves_the_others_alone() -> None:
     with pytest.raises(SettingsError, match="a push wants link"):
         play("push@0.01:panda_joint3:0.02", 40)  # it has no place in a line of words
-    for kind in set(KINDS) - {"push"}:
+    for kind in set(KINDS) - {"push", *INTERFACE}:
         simulator, said, _ = play(f"{kind}@0.01:panda_joint3:0.02", 40)
         assert len(said[5]) == 7, kind
         assert all(d.state.name == "ENABLED" for k, d in enumerate(simulator.drives) if k != 2), kind
@@ -367,6 +367,40 @@ def test_stuck_encoder_repeats_itself_and_a_jump_is_seen() -> None:
 def test_rebooted_drive_is_disabled() -> None:
     _, said, c = play("reboot@0.02:4")
     assert [c.states(r)[4].err for r in said][-1] == 0
+
+
+def test_an_interface_off_the_bus_says_so_once_and_then_nothing_passes() -> None:
+    _, said, _ = play("bus_off@0.02:0:0.01", 60)
+    told = [[f for f in map(frame.unpack, replies) if f.error] for replies in said]
+    off, on = (k for k, errors in enumerate(told) if errors)
+    assert on - off == 10
+    assert told[off][0].can_id & frame.ERR_BUSOFF
+    assert told[on][0].can_id & frame.ERR_RESTARTED
+    assert all(not replies for replies in said[off + 1 : on])
+    assert len(said[off]) == 1
+    assert len(said[on + 1]) == 7
+    _, said, _ = play("error_passive@0.02", 60)
+    (report,) = (f for replies in said for f in map(frame.unpack, replies) if f.error)
+    assert report.can_id & frame.ERR_CRTL
+    assert report.data[1] & frame.CRTL_PASSIVE
+    assert [len(replies) for replies in said].count(7) == 59
+
+
+def test_somebody_elses_commands_are_seen_and_taken_only_by_drives_that_ask_for_no_check() -> None:
+    simulator, said, _ = play("foreign@0.02:1:0.01")
+    own = simulator.drives[1].rating.motor
+    assert [sum(frame.unpack(r).can_id == own for r in replies) for replies in said].count(1) == 10
+    assert simulator.drives[1].state.name == "ENABLED"
+    plain = open_simulator(str(ROOT / "configs" / "openarm.toml"), inject=["foreign@0:1"])
+    of_all = scales(plain)[:7]
+    payloads = [mit.ENABLE] * 7, [mit.encode_command(0, 0, 0, 0, 1.0, s) for s in of_all]
+    for sent in (payloads[0], payloads[0], *[payloads[1]] * 20):
+        replies = plain.exchange([frame.pack(k + 1, data, fd=True, brs=True) for k, data in enumerate(sent)])
+    plain.close()
+    given = {
+        f.can_id: mit.decode_reply(f.data, of_all[f.can_id - 0x11]) for f in map(frame.unpack, replies) if f.can_id > 8
+    }
+    assert [round(reply.t, 1) for _, reply in sorted(given.items()) if reply] == [1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("text", ["silent", "silent@", "silent@x", "noise@1", "silent@1:nose", "silent@1:0:long"])

@@ -11,7 +11,7 @@ from rtctl.campaign.case import Asked
 from rtctl.campaign.play import played
 from rtctl.types import F64, Truth
 from tests.lab import ROOT, robot
-from tools.stop_campaign import ARMS, BRAKES, KINDS, plan, source
+from tools.stop_campaign import ARMS, BRAKES, KINDS, case_of, source
 from tools.stop_judge import Course, Run, judged
 
 PLANAR = robot(ROOT / "configs" / "planar4.toml")
@@ -24,7 +24,7 @@ def test_every_fault_is_played_on_every_arm_with_every_kind_of_brakes() -> None:
     found = list(islice(source.cases(Asked((), range(1), whole, {})), whole + 1))
     assert len(found) == whole == len({(case.robot, case.set) for case in found})
     assert {case.set for case in found} == {f"{kind} {brakes}" for kind in KINDS for brakes in BRAKES}
-    without = {case.config for case in found if case.set.endswith("none")}
+    without = {case.config for case in found if case.set.endswith(" none")}
     assert len(without) == len(ARMS) + 1  # the OpenArm as its maker ships it, and with E2E frames
     for text in without:
         assert {joint["brake"] for joint in tomllib.loads(text)["robot"]["joints"]} == {False}
@@ -103,17 +103,17 @@ def test_a_joint_that_is_held_may_not_pass_its_limit_and_one_that_falls_may() ->
     assert not any("limit" in text for text in judge("none", "drive_fault", {1: lambda t: over + 0.0 * t}).broken)
 
 
-@pytest.mark.parametrize("number", [10, 44, 55, 161, 166, 180])
-def test_what_once_broke_a_bound_keeps_it(number: int) -> None:
-    """Each by its number.
+ONCE_BROKEN = [  # arm, fault, brakes, number, and what was beyond its bound
+    ("planar4", "watchdog", "ideal", 10),  # it gives its last torque on, and threw the light joints while others faded
+    ("openarm_e2e", "stuck_encoder", "ideal", 44),  # the joint fell away, slowly at first, and past its limit
+    ("planar4", "reboot", "ideal", 55),  # what a closing brake's jerk was taken to last drove it on, by 0.09 to 0.12 m
+    ("puma560", "stuck_encoder", "none", 161),  # held by what the encoder said; a surprise had not told whose it was
+    ("puma560", "false_velocity", "none", 166),  # held by a speed that was false by less than is asked elsewhere
+    ("planar4", "drive_fault", "ideal", 180),  # damped joint by joint, a stretched arm went on as a whole, by 0.09 m
+]
 
-    10: a drive that hears nothing gives its last torque on, and threw the light joints while the others' faded.
-    44: the joint of a stuck encoder fell away, slowly at first, and past its limit; the other joints felt it.
-    55: what a closing brake's jerk had been taken to last drove the arm on, 0.09 to 0.12 m.
-    161: without brakes a joint was held by what its stuck encoder said; a surprise had not told whose it was.
-    166: without brakes a joint was held by a speed that was false by less than speeds are held to elsewhere.
-    180: the joints of a stretched arm were damped one by one, and together it went on for 0.09 m.
-    """
-    (case,) = (case for case in plan(1000, 0, ARMS, ",".join(BRAKES)).cases() if case.number == number)
-    row = played(case)
+
+@pytest.mark.parametrize(("arm", "kind", "brakes", "number"), ONCE_BROKEN)
+def test_what_once_broke_a_bound_keeps_it(arm: str, kind: str, brakes: str, number: int) -> None:
+    row = played(case_of(arm, kind, brakes, 0, number))
     assert (row["outcome"], row["failures"]) == ("stopped", "")

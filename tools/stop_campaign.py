@@ -16,11 +16,13 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from firmware_sim.inject import INTERFACE
 from rtctl.app.sim import simulate_setup
 from rtctl.arm.robot import Robot
 from rtctl.campaign.case import Asked, Case, Scene, options_within
@@ -50,6 +52,11 @@ KINDS = (
     "false_velocity",
     "encoder_jump",
     "reboot",
+    "duplicate",
+    "hot",
+    "foreign",
+    "error_passive",
+    "bus_off",
 )
 FIRST, LATEST = 0.4, 1.4  # [s] of the goal; of the fault
 AFTER = {"ideal": 1.0, "slipping": 1.0, "none": 2.2}  # [s] played after it
@@ -63,14 +70,11 @@ class Stops:
         """Yield the cases: arms, faults and brakes in turn."""
         words = options_within(asked, ("brakes",), "tools.stop_campaign").get("brakes", ",".join(BRAKES))
         arms, brakes = asked.robots or ARMS, words.split(",")
-        bare = {name: _bare(name) for arm in arms for name in (arm, BARE.get(arm, arm)) if "none" in brakes}
         for seed in asked.seeds:
             for number in range(asked.scenes):
                 arm, kind = arms[number % len(arms)], KINDS[number // len(arms) % len(KINDS)]
                 held = brakes[number // (len(arms) * len(KINDS)) % len(brakes)]
-                robot = BARE.get(arm, arm) if held == "none" and kind not in CORRUPT else arm
-                text = bare[robot] if held == "none" else ""
-                yield Case("tools.stop_campaign", robot, text, seed, number, f"{kind} {held}")
+                yield case_of(arm, kind, held, seed, number)
 
     def scene(self, case: Case) -> Scene:
         """Return the scene of a case: joints, instants and goals at random."""
@@ -81,13 +85,13 @@ class Stops:
         low, high = robot.q_min + 0.35, robot.q_max - 0.35
         posture = np.clip(robot.home + rng.uniform(-0.5, 0.5, robot.n), np.minimum(low, high), np.maximum(low, high))
         tip = robot.body.evaluate(posture, np.zeros(robot.n), robot.points, robot.own).x
-        at = float(rng.uniform(FIRST + 0.1, LATEST))
+        at, joint = float(rng.uniform(FIRST + 0.1, LATEST)), int(rng.integers(-1, robot.n))
         table = {
             "robot": case.robot,
             "duration_s": at + AFTER[held],
             "seed": case.number,
             "goal": [{"at_s": FIRST, "position_m": tip.tolist()}],
-            "fault": [{"at_s": at, "kind": kind, "joint": int(rng.integers(-1, robot.n))}],
+            "fault": [{"at_s": at, "kind": kind, "joint": -1 if kind in INTERFACE else joint}],
             "plant": {"brake": (SLIPS * robot.tau_rated).tolist() if held == "slipping" else held},
         }
         return Scene(table, known.path)
@@ -136,11 +140,19 @@ class _Kept:
         return self.play
 
 
-def _bare(arm: str) -> str:
-    """Return the file's text of an arm without its brakes."""
+def case_of(arm: str, kind: str, brakes: str, seed: int, number: int) -> Case:
+    """Return the case of a fault on an arm."""
+    robot = BARE.get(arm, arm) if brakes == "none" and kind not in CORRUPT else arm
+    return Case("tools.stop_campaign", robot, _text(robot, brakes == "none"), seed, number, f"{kind} {brakes}")
+
+
+@cache
+def _text(arm: str, bare: bool) -> str:
+    """Return the text of an arm's file; bare: without its brakes."""
     path = ROOT / "configs" / f"{arm}.toml"
     joints = tomllib.loads(path.read_text(encoding="utf-8"))["robot"]["joints"]
-    return text_of(path, Variant("", {("robot", "joints"): [{**joint, "brake": False} for joint in joints]}))
+    without: dict[tuple[str, ...], object] = {("robot", "joints"): [{**joint, "brake": False} for joint in joints]}
+    return text_of(path, Variant("", without if bare else {}))
 
 
 def rows_of(cases: Iterator[Case]) -> Iterator[Json]:
