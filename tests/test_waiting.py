@@ -258,6 +258,27 @@ def test_a_request_whose_caller_has_given_up_is_refused(now: float, taken: bool)
         request_of(message, BOUNDS, lambda: (1.0, 0.0, 0.0, 0.0), now)
 
 
+@pytest.mark.parametrize(
+    ("verb", "state", "advice"),
+    [
+        ("park", "IDLE", "rtctl arm comes first"),
+        ("float", "IDLE", "rtctl arm comes first"),
+        ("hold", "SAFE_STOP", "rtctl reset leaves it"),
+        ("arm", "FAULT", "rtctl reset leaves it"),
+        ("disarm", "IDLE", ""),
+    ],
+)
+def test_who_is_refused_for_the_state_is_told_what_comes_first(
+    place: str, capsys: Said, verb: str, state: str, advice: str
+) -> None:
+    with Toy(place, lambda request: f"{verb}: not possible in state {state}" if request.verb != Verb.NONE else ""):
+        assert main([verb, *PATIENT]) == EXIT_FAILED
+    said = capsys.readouterr().err
+    assert f"{verb}: not possible in state {state}" in said
+    assert advice in said
+    assert advice or said.strip().endswith(state)
+
+
 # ---- a gripper
 
 

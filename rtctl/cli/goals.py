@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from rtctl.cli.values import goal_messages, goes_on
-from rtctl.cli.waiting import LEAVES, Notes
+from rtctl.cli.waiting import Notes, hint
 from rtctl.errors import EXIT_FAILED, EXIT_OK, RequestError
 from rtctl.hal.client import Session, accepted
 from rtctl.plain import Json
@@ -18,7 +18,6 @@ ARRIVED = "arrived"
 PASSED = "passed"
 STALE = "goal_stale"
 MOVING_STATES = ("ARMED", "RUN")
-FIRST = {"IDLE": "; rtctl arm comes first", "STOPPING": "; it comes to rest now", **LEAVES}
 WORDS = {  # what a status means, for one who waits no more
     "moving": "it is still on its way",
     "escaping": "it is still going round what blocks the way",
@@ -71,12 +70,6 @@ def send(session: Session, message: Json) -> Json:
         return accepted(session.ask(message))
     except RequestError as error:
         raise RequestError(f"{error}{hint(str(error))}") from None
-
-
-def hint(refusal: str) -> str:
-    """Return what to do about a verb that a state does not allow, '' where nothing is known."""
-    _, _, state = refusal.partition("not possible in state ")
-    return FIRST.get(state, "")
 
 
 def send_and_wait(session: Session, message: Json, timeout: float) -> Outcome:

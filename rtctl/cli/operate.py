@@ -109,7 +109,7 @@ def add(commands: Commands) -> None:
     payload = command(commands, "payload", "tell what the tip carries", "rtctl payload 0.8 0 0 0.05", _payload)
     payload.add_argument("mass", metavar="KG", type=number, help="0: nothing")
     payload.add_argument(
-        "com", metavar="X Y Z", type=number, nargs="*", help="its centre in the tip's frame [m] (0 0 0)"
+        "com", metavar="X Y Z", type=number, nargs="*", default=(), help="its centre in the tip's frame [m] (0 0 0)"
     )
     add_daemon(payload)
     grip = command(commands, "grip", "move the gripper", "rtctl grip 1 --force 20", _grip)
@@ -194,6 +194,7 @@ def _payload(arguments: argparse.Namespace) -> int:
         raise UsageError(f"payload: got {len(arguments.com)} numbers after KG, wanted X Y Z or none")
     message: Json = {"verb": "payload", "mass_kg": arguments.mass}
     message |= {"com_m": arguments.com} if arguments.com else {}
+    _checked(message)
     return _said(_demand(arguments, message), f"payload: {arguments.mass:g} kg")
 
 
@@ -202,9 +203,9 @@ def _grip(arguments: argparse.Namespace) -> int:
 
     message: Json = {"verb": "grip", "closed": arguments.closed, "force_N": arguments.force or 0.0}
     message |= {"name": arguments.name} if arguments.name else {}
+    _checked(message)
     if arguments.no_wait:
         return _said(_demand(arguments, message), "grip: accepted")
-    _checked(message)
     with ready_session(arguments, "grip", 0.0) as session:
         return told("grip", gripped(session, message, arguments.timeout))
 

@@ -84,6 +84,8 @@ CODES: dict[str, dict[int, str]] = {  # what 1 and 78 mean to a command; 0 and 2
     "goal": {1: "no daemon, refused, or not reached"},
     "goals": {1: "no daemon, or a goal was refused or not reached"},
     "obstacle": {1: "no daemon, or refused"},
+    "payload": {1: "no daemon, or refused"},
+    "grip": {1: "no daemon, refused, or it neither came there nor holds anything"},
     "status": {1: "no daemon, or it ended"},
     "sim": {1: "a goal was missed, or something was touched (--allow-miss: never)", 78: CONFIG_REFUSED},
     "doctor": {1: "something that torque needs is missing"},
@@ -92,7 +94,7 @@ CODES: dict[str, dict[int, str]] = {  # what 1 and 78 mean to a command; 0 and 2
     "bench": {1: "a figure misses its target"},
     "experiment": {1: "an experiment could not be played"},
     "init": {1: "the robot cannot be controlled, or its packages are missing", 78: "the written file is refused"},
-    **{verb: {1: VERB_FAILED} for verb in ("arm", "disarm", "stop", "reset", "recover")},
+    **{verb: {1: VERB_FAILED} for verb in ("arm", "disarm", "park", "stop", "reset", "float", "hold", "recover")},
 }
 
 

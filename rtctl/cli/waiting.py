@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ CLEARING_TIME = 2.0  # [s] for drives to clear their faults after a reset
 AUTOPILOT_TIME = 5.0  # [s] for an autopilot to disarm once the robot is IDLE
 LEAVE = "; rtctl reset leaves it, once its cause is gone"
 LEAVES = {"SAFE_STOP": LEAVE, "FAULT": LEAVE}
+FIRST = {"IDLE": "; rtctl arm comes first", "STOPPING": "; it comes to rest now", **LEAVES}
+MOVES = ("park", "float", "hold")  # verbs of an arm that is armed
 AIMS = {
     "arm": "the robot is armed and holds",
     "recover": "the robot is armed and moves inward",
@@ -119,9 +122,14 @@ def perform(session: Session, message: Json, timeout: float) -> End:
             break
         except RequestError as error:  # the first reset has the drives clear their faults; a later one finds them gone
             if "being cleared" not in str(error) or time.monotonic() - begun > CLEARING_TIME:
-                raise RequestError(f"{error}{LEAVES.get(str(error).rpartition(' in state ')[2], '')}") from None
+                raise RequestError(f"{error}{hint(str(error), FIRST if verb in MOVES else LEAVES)}") from None
             time.sleep(POLL)
     return _awaited(session, verb, timeout)
+
+
+def hint(refusal: str, known: Mapping[str, str] = FIRST) -> str:
+    """Return what to do about a verb that a state does not allow, "" where nothing is known."""
+    return known.get(refusal.rpartition("not possible in state ")[2], "")
 
 
 def _awaited(session: Session, verb: str, timeout: float) -> End:
