@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rtctl.arm.faults import BRAKES
 from rtctl.arm.robot import Robot
 from rtctl.types import B1, F64, Drive, State, Truth
 
@@ -66,6 +67,7 @@ class Course:
         self.going: list[Truth] = []  # until the detection
         self.rows: list[Truth] = []
         self.contacts = 0
+        self.halted: int | None = None  # number of the period since which a fault holds an arm that may go on by itself
 
     def __call__(self, servo: Any, truth: Truth, turn: Any) -> None:
         """Take a period into account."""
@@ -75,13 +77,20 @@ class Course:
         copied = truth._replace(**{name: getattr(truth, name).copy() for name in ("q", "qd", "tip")})
         if not self.rows and servo.memory.state == State.RUN:
             self.going.append(copied)
+            halted = servo.memory.in_force & BRAKES != 0
+            self.halted = len(self.going) - 1 if halted and self.halted is None else self.halted if halted else None
             return
         self.rows.append(copied)
         if turn.command.drive == Drive.DISABLE:
             self.closed = min(self.closed, truth.time)
 
     def whole(self, drives: Sequence[Any]) -> None:
-        """Note, at the end, when the first drive of all tripped of silence: it is no fault of the stop."""
+        """Note, at the end, when the first drive of all tripped of silence: it is no fault of the stop.
+
+        An arm that is held at the end by a fault that clears by itself was noticed when that came.
+        """
+        if not self.rows and self.halted is not None:
+            self.going, self.rows = self.going[: self.halted], self.going[self.halted :]
         for drive in drives:
             for trip in drive.trips:
                 if trip.code == SILENCE and self.rows and trip.at * 1e-9 > self.rows[0].time:

@@ -48,6 +48,7 @@ HOT = np.dtype(
             ("own_kd", _REAL, _JOINT),  # [Nms/rad]
             ("own_t", _REAL, _JOINT),  # [Nm] the torque beside
             ("own_g", _REAL, _JOINT),  # [Nm] of it gravity's
+            ("own_untrue", _INT),  # it began since a drive gave another torque than it was told
             ("lost", _INT),  # bits of the joints that cannot be held
             ("no_position", _INT),  # bits of the joints whose position is untrue
             ("no_speed", _INT),  # and whose speed is

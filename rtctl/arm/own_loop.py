@@ -4,8 +4,10 @@
 
 p, v come to rest from where the joint was, t carries gravity and, by the model, the way to rest and the pull of joints
 that fall (and damps, where the joint's speed is known). A joint whose encoder lies gets no term of it: one whose
-position alone lies is damped, one of which nothing is true is let go, as is one whose drive has tripped. The others go
-on holding: they keep the rest from following.
+position alone lies is damped, one of which nothing is true is let go, as is one whose drive has tripped. So is one that
+flees while its drive itself says that it gives little of what it is told, as where a second master commands it: else
+the model takes it for held, and what it does to its neighbours for their lie. The others go on holding: they keep the
+rest from following.
 
 Where something was a surprise and nobody knows which joint it was, an encoder that has repeated itself since before may
 be stuck: held by what it says, its joint would be driven by the difference to it for ever. It is let go until it moves
@@ -41,11 +43,14 @@ NOTICE = 0.1  # [s] after the onset of a stop, in which a joint that was let go 
 STEEPER = 2.0  # times the law's braking: a joint that comes near its limit comes to rest with more
 SWEEPS = 20  # of the joints that fall: how fast, of what the others do
 SPEED_LIE = 0.3  # [rad/s] by which a speed is untrue where something was a surprise: far beyond noise
+FLEES = 0.2  # [rad/s] away from where it is held to be, and from the speed it shall have there
+LITTLE = 0.25  # of the torque that a drive was told
 JUMP = 0.1  # [rad] from where the joint is held to be: the position is untrue, the speed need not be
 
 # numbers of the enumerations, as compiled code reads them
 _STOPPING, _SAFE_STOP = int(State.STOPPING), int(State.SAFE_STOP)
 _SS1, _CONTACT = int(Severity.SS1), BIT["contact"]
+_TORQUE_UNTRUE = BIT["torque_mismatch"] | BIT["foreign_command"]  # a drive does not give what it was told
 _SURPRISES = BIT["innovation"] | BIT["collision_hard"]  # they do not say which joint's measurements lie, if any does
 
 
@@ -60,21 +65,49 @@ def holds_itself(c: RecordRow, m: RecordRow) -> bool:
 
 
 @kernel
+def _disobeys(c: RecordRow, m: RecordRow, f: Feedback, i: int) -> bool:
+    """Return whether joint i flees from where it is held while its drive says that it gives little of what it is told.
+
+    What it was told lately is beyond the tolerance of an echo all the time: a drive that is a tick behind is none.
+    """
+    speed, tolerance = f.qd[i] - m.own_v[i], c.safety_torque_tolerance[i]
+    if f.replies[i] == 0 or abs(speed) < FLEES or speed * (f.q[i] - m.own_p[i]) <= 0.0:
+        return False
+    least, most = m.sent[0, i], m.sent[0, i]
+    for r in range(1, m.sent.shape[0]):
+        least, most = min(least, m.sent[r, i]), max(most, m.sent[r, i])
+    return bool((least > tolerance and f.tau[i] < LITTLE * least) or (most < -tolerance and f.tau[i] > LITTLE * most))
+
+
+@kernel
+def _speed_lies(m: RecordRow, i: int) -> bool:
+    """Return whether the speed of joint i is not that of its positions."""
+    monitors = m.encoder_monitors
+    if m.in_force & _SURPRISES and abs(monitors[RESIDUAL, i]) > SPEED_LIE:
+        return True  # it may have been this: a stop by such a speed cannot wait for all that evidence
+    return bool(monitors[BEYOND, i] >= DISAGREE_TICKS)
+
+
+@kernel
 def _distrust(c: RecordRow, m: RecordRow, f: Feedback) -> None:
     """Note of which joints the encoder's position or speed is untrue, as long as the stop lasts; f: as it came.
 
-    A joint that falls shakes the others when it comes to its end: what they do then says nothing of their encoders.
+    A joint that falls shakes the others when it comes to its end: what they do then says nothing of their encoders. Nor
+    does a motion that is missed tell of one that is stuck, where it began with an untrue torque, or the speed of a
+    joint that moves is untrue: what the model expects of all follows from these.
     """
     n, monitors = f.q.shape[0], m.encoder_monitors
+    expected = m.own_untrue == 0
+    for i in range(n):
+        if _disobeys(c, m, f, i):
+            m.lost = m.lost | 1 << i
+        expected = expected and not (_speed_lies(m, i) and monitors[EQUAL, i] < STUCK_TIME)
     if m.lost != 0 and m.tick - m.own_since > NOTICE / c.dt:
         return
     for i in range(n):
         bit = 1 << i
-        stuck = monitors[EQUAL, i] >= STUCK_TIME and abs(monitors[TRAVEL, i]) > STUCK_TRAVEL
-        lies = monitors[BEYOND, i] >= DISAGREE_TICKS
-        if m.in_force & _SURPRISES:  # it may have been this: a stop by such a speed cannot wait for all that evidence
-            lies = lies or abs(monitors[RESIDUAL, i]) > SPEED_LIE
-        if stuck or lies:
+        stuck = expected and monitors[EQUAL, i] >= STUCK_TIME and abs(monitors[TRAVEL, i]) > STUCK_TRAVEL
+        if stuck or _speed_lies(m, i):
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
         if f.replies[i] > 0 and not (math.isfinite(f.q[i]) and math.isfinite(f.qd[i])):
             m.no_position, m.no_speed = m.no_position | bit, m.no_speed | bit
@@ -87,7 +120,7 @@ def _begin(c: RecordRow, m: RecordRow, n: int) -> None:
     m.own_phase, m.own_since = BRAKING, m.tick
     m.own_p[:n], m.own_v[:n], m.own_t[:n] = m.q[:n], m.qd[:n], m.sent[0, :n]
     m.own_kp[:n], m.own_kd[:n] = c.stop_kp[:n], c.stop_kd[:n]
-    m.lost = 0
+    m.lost, m.own_untrue = 0, 1 if m.in_force & _TORQUE_UNTRUE and not m.in_force & _SURPRISES else 0
     for i in range(n):
         m.own_p[i] = min(max(m.own_p[i], c.q_min[i]), c.q_max[i])
         if m.in_force & _SURPRISES and m.encoder_monitors[EQUAL, i] >= STUCK_TIME:
@@ -219,7 +252,7 @@ def _let_go(c: RecordRow, m: RecordRow, f: Feedback) -> None:
     """Take the terms that are not to be trusted from the drives' loops, and give back what was; f: as it came."""
     for i in range(f.q.shape[0]):
         bit, off = 1 << i, f.drive[i] != 1
-        if off or m.no_speed & bit:
+        if off or (m.no_speed | m.lost) & bit:
             m.lost = m.lost | bit
             m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0
             m.own_t[i] = 0.0 if off else m.own_t[i]
@@ -252,10 +285,11 @@ def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surr
     for i in range(n):
         step, heard = c.tau_rate[i] * c.dt, f.age[i] <= c.safety_lost_periods * c.dt
         t = m.own_g[i] + inertial[i]
-        if m.own_kd[i] == 0.0:  # it is let go
-            t = 0.0
-        elif heard and f.replies[i] > 0 and not m.no_position >> i & 1:
-            t -= c.stop_damping[i] * (m.qd[i] - m.own_v[i])
+        speed = f.qd[i] if m.no_position >> i & 1 else m.qd[i]  # estimated from positions as well
+        if m.own_kd[i] == 0.0:  # it is let go; no torque at all is no step of a drive's: it drifts by less than that
+            t = (0.25 if m.tick & 1 else -0.25) * c.tau_lsb[i]
+        elif heard and f.replies[i] > 0:
+            t -= c.stop_damping[i] * (speed - m.own_v[i])
         if not math.isfinite(t):
             t = 0.0
         t = min(max(t, -c.tau_max[i]), c.tau_max[i])
