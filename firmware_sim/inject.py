@@ -24,7 +24,8 @@ KINDS = {
     "corrupt_crc": "one bit of every reply is flipped",
     "corrupt_command": "one bit of every command is flipped",
     "weak": "the drive gives half the torque it is told, and says nothing of it",
-    "stuck_encoder": "the encoder repeats its last value",
+    "stuck_encoder": "the encoder repeats its last position and speed",
+    "dead_encoder": "the encoder repeats its last position, the speed that the drive makes of it is 0",
     "false_velocity": "the encoder's speed reads 1 rad/s too high",
     "encoder_jump": "the encoder is off by 0.5 rad",
     "push": "something pushes a link of the arm: link, newton, direction in the world",
@@ -172,6 +173,8 @@ class Injector:
             return q, qd
         if self.active("stuck_encoder", now, joint):
             return self.stuck.setdefault(joint, (q, qd))
+        if self.active("dead_encoder", now, joint):
+            return self.stuck.setdefault(joint, (q, 0.0))
         self.stuck.pop(joint, None)
         if self.active("false_velocity", now, joint):
             return q, qd + 1.0

@@ -1,5 +1,6 @@
 """Contact that nobody told of: pushes in the plant, and what the controller makes of them and when."""
 
+import math
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from firmware_sim.bullet import pb
 from firmware_sim.plant import Plant
 from firmware_sim.settings import SettingsError, load
 from firmware_sim.simulator import open_simulator
+from rtctl.arm.encoders import halted
 from rtctl.types import Severity, State
 from tests.lab import PANDA, Lab, lab
 
@@ -72,6 +74,29 @@ def test_loads_within_what_is_declared_are_no_collision(touchy: Path, seed: int)
     with moving(touchy, None, plant) as here:
         assert played(here, 2.4) >= 2.4 - 1e-6
         assert here.memory.state == State.RUN
+
+
+@pytest.mark.parametrize(
+    ("equal", "last", "qd", "wanted"),
+    [
+        (0.001, 0.11, 0.0, True),
+        (0.001, -0.11, 0.0, True),
+        (0.0, 0.11, 0.0, False),  # its position has changed in this tick
+        (0.001, 0.09, 0.0, False),
+        (0.001, 0.11, 0.014, True),  # a step of its speed is 0.01 rad/s
+        (0.001, 0.11, -0.016, False),
+    ],
+)
+def test_a_joint_halts_that_moved_until_its_position_stayed_the_same(
+    equal: float, last: float, qd: float, wanted: bool
+):
+    assert halted(equal, last, qd, 0.01 / math.sqrt(12.0)) is wanted
+
+
+def test_a_coarse_speed_tells_of_a_halt_only_from_five_of_its_steps():
+    assert halted(0.001, 0.26, 0.07, 0.05 / math.sqrt(12.0))
+    assert not halted(0.001, 0.24, 0.07, 0.05 / math.sqrt(12.0))
+    assert not halted(0.001, 0.26, 0.08, 0.05 / math.sqrt(12.0))
 
 
 # ---- the push itself

@@ -54,6 +54,7 @@ def constants(**changes: float | F64) -> RecordRow:
         "safety_lost_periods": 10.0,
         "safety_torque_tolerance": np.array([3.0, 1.5]),
         "tau_lsb": np.array([0.04, 0.02]),
+        "joint_r_qd": np.array([0.005, 0.005]),
         "avoid_rho_min": 0.015,
         **changes,
     }
@@ -388,7 +389,7 @@ def test_a_joint_whose_position_alone_is_untrue_is_damped_by_its_speed_as_measur
 def test_a_stop_that_begins_with_an_untrue_torque_knows_it(faults: tuple[str, ...], wanted: int) -> None:
     m = memory(np.zeros(2), np.zeros(2), np.zeros(2))
     m.in_force, m.own_untrue = sum(BIT[name] for name in faults), 1 - wanted
-    module._begin(constants(), m, 2)
+    module._begin(constants(), m, healthy(m.q[:2], 0, DT), 2)
     assert m.own_untrue == wanted
 
 
@@ -396,7 +397,7 @@ def test_a_stop_begins_where_the_joints_are_at_their_speed_with_the_torque_they_
     c, m = constants(), memory(np.array([2.6, -2.6]), np.array([0.3, -0.4]), np.array([3.0, -2.0]))
     m.lost, m.in_force = 3, SURPRISED
     m.encoder_monitors[EQUAL, :2] = 0.019, 0.02
-    module._begin(c, m, 2)
+    module._begin(c, m, healthy(m.q[:2], 0, DT, qd=m.qd[:2].copy()), 2)
     assert m.own_phase == BRAKING
     assert m.own_since == 100
     assert m.own_p[:2].tolist() == [2.5, -2.5]  # within the limits
@@ -406,7 +407,7 @@ def test_a_stop_begins_where_the_joints_are_at_their_speed_with_the_torque_they_
     assert m.own_kp[:2].tolist() == [60.0, 0.0]
     assert m.own_kd[:2].tolist() == [1.0, 0.0]
     m.in_force = BIT["drive_fault"]
-    module._begin(c, m, 2)
+    module._begin(c, m, healthy(m.q[:2], 0, DT, qd=m.qd[:2].copy()), 2)
     assert m.own_kp[:2].tolist() == [60.0, 40.0]
     assert m.own_kd[:2].tolist() == [1.0, 0.5]
     assert m.own_v[:2].tolist() == [0.3, -0.4]

@@ -116,6 +116,8 @@ ONCE_BROKEN = [  # arm, fault, brakes, seed, number, and what was beyond its bou
     ("ur5", "false_velocity", "none", 25, 728),  # what a false speed made the model expect of a wrist let that fall too
     ("panda", "stuck_encoder", "none", 25, 722),  # let go, a joint was driven by half a step of its drive's torque
     ("planar4", "encoder_jump", "none", 25, 985),  # damped by the drive's kd alone, a heavy joint went on for 2 s
+    ("planar4", "dead_encoder", "ideal", 27, 0),  # all: taken for a contact, and held by what they said, at 14 rad/s
+    ("planar4", "dead_encoder", "ideal", 27, 1),  # one: the same, 0.96 m
     ("planar4", "error_passive", "none", 25, 755),  # braked by a fault that clears by itself, and taken for astray
 ]
 

@@ -49,6 +49,7 @@ KINDS = (
     "corrupt_command",
     "weak",
     "stuck_encoder",
+    "dead_encoder",
     "false_velocity",
     "encoder_jump",
     "reboot",

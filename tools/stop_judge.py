@@ -12,7 +12,7 @@ from rtctl.types import B1, F64, Drive, State, Truth
 
 # kinds of faults of which a joint without brake falls: its drive gives nothing, or its encoder lies to it
 UNDRIVEN = ("drive_fault", "overheat", "watchdog", "corrupt_command", "reboot", "foreign", "bus_off")
-FALLS = frozenset((*UNDRIVEN, "stuck_encoder", "false_velocity"))
+FALLS = frozenset((*UNDRIVEN, "stuck_encoder", "dead_encoder", "false_velocity"))
 SILENCE = 0xD  # what a drive says that has heard nothing for too long
 ASTRAY = 0.05  # [m] of the tip of an arm that goes on, from where it is at that time without the fault
 KNOCK = 5e-3  # [s] after the brakes close, in which one that holds a heavy joint throws the lighter ones

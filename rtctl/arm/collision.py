@@ -9,7 +9,9 @@ While a joint is slow enough to stick, its track follows at once and its bound i
 
 A joint whose encoder is stuck may be driven off, too slowly for its own torque to tell, while friction might as well
 hold it. It shakes the others: what they feel is taken for a lie at a part of the bound already, where some encoder
-repeats itself while another joint slides. A contact that is taken for it is no worse for a stop that trusts nothing.
+repeats itself while another joint slides. And an encoder that dies in motion is like a blow that stops its joint at
+once: a contact in which one halts is taken for a lie. A contact that is taken for it is no worse for a stop that trusts
+nothing; a stop that holds by what such encoders say drives the arm away.
 
 A force on a link turns no joint beyond it: the last joint that feels it carries the link that was touched (De Luca,
 Albu-Schaeffer, Haddadin and Hirzinger 2006). m, c: as in `sensing`.
@@ -20,7 +22,7 @@ import math
 import numpy as np
 
 from rtctl.arm.disturbance import BANDWIDTH, GRAVITY, LASTING, PAYLOAD_REACH, spread
-from rtctl.arm.encoders import EQUAL, STUCK_TIME
+from rtctl.arm.encoders import EQUAL, LAST, STUCK_TIME, halted
 from rtctl.arm.model import Model
 from rtctl.kernel import kernel
 from rtctl.kernel.reductions import norm
@@ -32,7 +34,7 @@ STEADY = 0.06  # [s] since it does: the observer has seen its friction
 FADING = 0.06  # [s] in which the law's own acceleration has come and gone
 TAKING = 2.0  # [s] in which a payload that was told is taken up or put down
 BEGIN = 0.5  # [s] of RUN in which the arm is found as it is
-CONFIRMED = 3  # ticks
+CONFIRMED, SPARE = 3, 2  # ticks of a contact; and before, in which its first torque was below the bound
 LEVER = 0.1  # [m] of all joints together, below which a weight at the tip is not felt
 HIDDEN, SLIGHT = 1.5, 3.0  # times the weight that is felt, and [N] beside it
 FELT = 0.5  # of its bound: so much of the torque counts as felt by a joint
@@ -128,6 +130,17 @@ def _repeats(m: RecordRow, n: int) -> bool:
 
 
 @kernel
+def _halts(c: RecordRow, m: RecordRow, qd: F64) -> bool:
+    """Return whether some joint that moved stood still at once when the contact began; qd (n,) [rad/s]."""
+    begun = (CONFIRMED + SPARE) * c.dt
+    for i in range(qd.shape[0]):
+        equal = m.encoder_monitors[EQUAL, i]
+        if equal <= begun and halted(equal, m.encoder_monitors[LAST, i], qd[i], c.joint_r_qd[i]):
+            return True
+    return False
+
+
+@kernel
 def watch_contact(c: RecordRow, m: RecordRow, qd: F64, model: Model, elapsed: float) -> None:
     """Look for a contact in the external torque of this tick; qd (n,) [rad/s] as measured."""
     n = qd.shape[0]
@@ -155,6 +168,7 @@ def watch_contact(c: RecordRow, m: RecordRow, qd: F64, model: Model, elapsed: fl
         return
     m.contact_level = STRUCK if struck else TOUCHED
     if m.touches == CONFIRMED:
+        m.contact_level = UNEXPLAINED if _halts(c, m, qd) else m.contact_level
         m.contact_link = 1
         for i in range(n):
             if abs(fast[i]) > FELT * (c.collision[i] + bound[i]):

@@ -125,9 +125,9 @@ def examine_feedback(f: Feedback, sent: F64, near: Clearances, bounds: JointBoun
 def encoder_flags(
     before: F64, f: Feedback, previous: PreviousPositions, expected: ExpectedMotion, bounds: EncoderBounds, dt: float
 ) -> tuple[F64, int]:
-    """Return the monitors (5, n) of the encoders after a tick, and the flags STUCK and DISAGREE.
+    """Return the monitors (6, n) of the encoders after a tick, and the flags STUCK and DISAGREE.
 
-    before (5, n): the monitors of the last tick; dt [s] servo period.
+    before (6, n): the monitors of the last tick; dt [s] servo period.
     """
     after, stuck, disagree = monitor_encoders(before, f, previous, expected, bounds, dt)
     return after, STUCK * stuck | DISAGREE * disagree

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rtctl.arm.encoders import MONITORS
 from rtctl.arm.escape import DIRECTIONS, Escape
 from rtctl.arm.faults import Counters
 from rtctl.arm.robot import JOINTS_MAX
@@ -75,7 +76,7 @@ HOT = np.dtype(
             ("qdd", _REAL, _JOINT),  # [rad/s2] predicted from the torque of the last command
             ("q_previous", _REAL, _JOINT),  # [rad] of the last feedback
             ("age_previous", _REAL, _JOINT),  # [s] how old it was
-            ("encoder_monitors", _REAL, (5, JOINTS_MAX)),  # on the encoders; see `encoders.monitor_encoders`
+            ("encoder_monitors", _REAL, (MONITORS, JOINTS_MAX)),  # on the encoders; see `encoders.monitor_encoders`
             ("rest", _INT),  # ticks all joints have been at rest
             # task
             ("has_goal", _INT),

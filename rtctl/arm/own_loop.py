@@ -9,9 +9,10 @@ flees while its drive itself says that it gives little of what it is told, as wh
 the model takes it for held, and what it does to its neighbours for their lie. The others go on holding: they keep the
 rest from following.
 
-Where something was a surprise and nobody knows which joint it was, an encoder that has repeated itself since before may
-be stuck: held by what it says, its joint would be driven by the difference to it for ever. It is let go until it moves
-by its own account, which one that is true tells within a step of the encoder, and held from then on.
+Where something was a surprise and nobody knows which joint it was, an encoder that has repeated itself since before, or
+that halted then, may be stuck: held by what it says, its joint would be driven by the difference to it for ever. It is
+let go until it moves by its own account, which one that is true tells within a step of the encoder, and is held from
+then on.
 
 When all rest, the arm is lowered down the slope of its potential energy, qd ~ -g(q), until gravity moves it no more,
 it lies on something, or its limits carry it; then kp and t fade, and torque is cut. m, c: as in `sensing`.
@@ -21,7 +22,7 @@ import math
 
 import numpy as np
 
-from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, RESIDUAL, STUCK_TIME, STUCK_TRAVEL, TRAVEL
+from rtctl.arm.encoders import BEYOND, DISAGREE_TICKS, EQUAL, LAST, RESIDUAL, STUCK_TIME, STUCK_TRAVEL, TRAVEL, halted
 from rtctl.arm.faults import BIT
 from rtctl.arm.model import Model
 from rtctl.arm.sensing import Surroundings
@@ -116,14 +117,16 @@ def _distrust(c: RecordRow, m: RecordRow, f: Feedback) -> None:
 
 
 @kernel
-def _begin(c: RecordRow, m: RecordRow, n: int) -> None:
+def _begin(c: RecordRow, m: RecordRow, f: Feedback, n: int) -> None:
     m.own_phase, m.own_since = BRAKING, m.tick
     m.own_p[:n], m.own_v[:n], m.own_t[:n] = m.q[:n], m.qd[:n], m.sent[0, :n]
     m.own_kp[:n], m.own_kd[:n] = c.stop_kp[:n], c.stop_kd[:n]
     m.lost, m.own_untrue = 0, 1 if m.in_force & _TORQUE_UNTRUE and not m.in_force & _SURPRISES else 0
     for i in range(n):
         m.own_p[i] = min(max(m.own_p[i], c.q_min[i]), c.q_max[i])
-        if m.in_force & _SURPRISES and m.encoder_monitors[EQUAL, i] >= STUCK_TIME:
+        equal, last = m.encoder_monitors[EQUAL, i], m.encoder_monitors[LAST, i]
+        repeats = equal >= STUCK_TIME or halted(equal, last, f.qd[i], c.joint_r_qd[i])
+        if m.in_force & _SURPRISES and repeats:
             m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, 0.0, 0.0
 
 
@@ -258,7 +261,7 @@ def _let_go(c: RecordRow, m: RecordRow, f: Feedback) -> None:
             m.own_t[i] = 0.0 if off else m.own_t[i]
         elif m.no_position & bit:
             m.own_kp[i], m.own_kd[i], m.own_v[i] = 0.0, c.stop_kd[i], 0.0
-        elif m.own_kd[i] < c.stop_kd[i] and m.encoder_monitors[EQUAL, i] < STUCK_TIME and m.own_phase != SINKING:
+        elif m.own_kd[i] < c.stop_kd[i] and m.encoder_monitors[EQUAL, i] == 0.0 and m.own_phase != SINKING:
             m.own_kp[i], m.own_kd[i] = c.stop_kp[i], c.stop_kd[i]
             m.own_p[i], m.own_v[i] = min(max(m.q[i], c.q_min[i]), c.q_max[i]), m.qd[i]
 
@@ -271,7 +274,7 @@ def own_loop(c: RecordRow, m: RecordRow, f: Feedback, model: Model, around: Surr
     """
     n = g.shape[0]
     if m.own_phase == 0:
-        _begin(c, m, n)
+        _begin(c, m, f, n)
     _distrust(c, m, f)
     if m.own_phase != SINKING:
         m.own_g[:n] = g

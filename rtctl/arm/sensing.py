@@ -26,7 +26,7 @@ from rtctl.arm.detection import (
     examine_feedback,
 )
 from rtctl.arm.disturbance import BANDWIDTH, LASTING, RESTING
-from rtctl.arm.encoders import EncoderBounds, ExpectedMotion, PreviousPositions
+from rtctl.arm.encoders import MONITORS, EncoderBounds, ExpectedMotion, PreviousPositions
 from rtctl.arm.estimator import (
     EstimatorParams,
     JointEstimate,
@@ -256,7 +256,7 @@ def detect_faults(
             c.safety_torque_tolerance[:n].copy(), c.safety_limit_tolerance, c.safety_speed_tolerance, REST_SPEED
         ),
     )
-    monitors, flags = np.zeros((5, n)), found.flags
+    monitors, flags = np.zeros((MONITORS, n)), found.flags
     if active:
         monitors, more = _monitored(c, m, f, model)
         flags |= more
