@@ -50,7 +50,7 @@ def test_words_types_and_what_is_told_are_left_alone():
 def test_every_change_is_a_program_and_has_a_name_of_its_own(target):
     source = (ROOT / target.file).read_text(encoding="utf-8")
     made = mutants(source)
-    assert len({m.key for m in made}) == len(made) > 50
+    assert len({m.key for m in made}) == len(made) > 40
     for mutant in made:
         ast.parse(mutant.applied(source))
     listed = [row for row in equals() if row.module == target.file]
